@@ -254,16 +254,16 @@ def test_what_breaks_in_touch_gains_nothing() -> None:
         time={"scheme": "explicit", "step": 0.02, "end": 1.0},
     )  # fmt: skip
     (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
-    while len(contact._step_end.slips[0][0].keys) <= 3:
+    while len(contact._step_end.slips[0].keys) <= 3:
         march(scene, state, 5)
-    before, held, graph = contact.stored_energy(), contact._step_end.slips[0][0], scene.fracture.graph
+    before, held, graph = contact.stored_energy(), contact._step_end.slips[0], scene.fracture.graph
     assert before > 0
     pushed = contact.contact_forces()
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.4)
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     assert abs(contact.contact_forces()).sum() < 1.01 * abs(pushed).sum()
-    springs = contact._parts[0][0][0].contacts
+    springs = contact._touching[0][0].contacts
     assert (springs.start_stiffness > 0).sum() == len(held.keys)
     np.testing.assert_array_equal(np.sort(springs.slip[springs.start_stiffness > 0, 0]), np.sort(held.slip[:, 0]))
     assert 0.3 * before < contact.stored_energy() <= before * (1 + 1e-9)
@@ -276,14 +276,14 @@ def test_springs_of_points_that_are_gone_are_not_in_a_checkpoint() -> None:
         obstacle=[floor(2, -0.002, friction=0.5)], time={"scheme": "explicit", "step": 0.02, "end": 1.0},
     )  # fmt: skip
     (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
-    while not len(contact._step_end.slips[0][0].keys):
+    while not len(contact._step_end.slips[0].keys):
         march(scene, state, 5)
     end = contact._step_end
-    held, *of_facets = end.slips[0]
+    held = end.slips[0]
     with_gone = Slips(np.append(held.keys, 1), np.append(held.slip, [[0.1, 0.0]], axis=0))
-    contact.restore(replace(end, slips=[[with_gone, *of_facets]]))
+    contact.restore(replace(end, slips=[with_gone]))
     contact.from_checkpoint(contact.to_checkpoint())
-    kept = contact._step_end.slips[0][0]
+    kept = contact._step_end.slips[0]
     np.testing.assert_array_equal(kept.keys, np.sort(held.keys))
     np.testing.assert_array_equal(kept.slip, held.slip[np.argsort(held.keys)])
 

@@ -23,7 +23,7 @@ from dolfinx import fem
 from ..array_types import Values
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
+from ..mesh.parallel import max_over_ranks, sum_over_ranks
 from .clearance import Clearance
 from .mesh_obstacle_term import build_mesh_obstacles
 from .mesh_obstacles import MeshObstacle
@@ -57,20 +57,7 @@ class PenaltyContact(Term):
         meshes: Sequence[MeshObstacle] = (),
         is_far: Callable[[], bool] | None = None,
     ) -> None:
-        """Build the term (collective).
-
-        Args:
-            domain: mesh.
-            u: displacement.
-            law: contact law.
-            mass: (owned dofs,) lumped, kg.
-            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
-            meshes: obstacles; none: the body touches itself.
-            is_far: as for PenaltyState.
-
-        Raises:
-            InputError: if the surface at rest intersects itself, or an obstacle.
-        """
+        """Build the term (collective); arguments and errors as of PenaltyBodySurface, `is_far` as of PenaltyState."""
         self.law, self._domain, self._u, self.comm = law, domain, u, domain.comm
         self._owned = domain.node_count * domain.dim
         self._friction_loss = 0.0
@@ -100,12 +87,6 @@ class PenaltyContact(Term):
         self._forces: list[PenaltyForces | None] | None = None
         self._nodal_forces: Values | None = None
 
-    def clear_search(self) -> None:
-        """Discard the candidates of collision detection (not collective)."""
-        self.update_displacement()
-        for part in self._parts:
-            part.pairs.clear_caches()
-
     # --- forces and energy ---
 
     def _end_positions(self) -> Values:
@@ -126,8 +107,13 @@ class PenaltyContact(Term):
         """Forces of each part with the body at x (n, d), m; None: it is far."""
         if self._forces is None:
             parts = zip(self._parts, self._start_poses(), strict=True)
-            self._forces = [None if part.is_far(x) else part.forces(x, self._start, pose) for part, pose in parts]
+            self._forces = [None if part.is_far(x) else self._evaluate(part, x, pose) for part, pose in parts]
         return self._forces
+
+    def _evaluate(self, part: PenaltyPart, x: Values, start_pose: Pose | None) -> PenaltyForces:
+        """Forces of a part with the body at x (n, d), m; friction begins at the start of the step, if one began."""
+        start = None if self._start is None or not part.friction else part.points(self._start, start_pose)
+        return part.pairs.forces(part.points(x), start, part.friction)
 
     def min_gap(self) -> float:
         """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
@@ -200,7 +186,7 @@ class PenaltyContact(Term):
             history = part.pairs.history
             if forces is None and not len(history.points):
                 continue
-            forces = forces or part.forces(x)
+            forces = forces or self._evaluate(part, x, None)
             self._friction_loss += forces.dissipated(history.spring_energy)
             part.pairs.end_step(part.points(x), forces.slips)
             is_near |= len(part.pairs.history.points) > 0
@@ -208,6 +194,9 @@ class PenaltyContact(Term):
 
     def begin_solve(self) -> None:
         """Do nothing: no system is solved."""
+
+    def clear_search(self) -> None:
+        """Do nothing: candidates have no effect on results."""
 
 
 class PenaltyMeshContact(PenaltyContact):
@@ -231,10 +220,8 @@ class PenaltyMeshContact(PenaltyContact):
         max_added: float,
     ) -> None:
         """`bodies`: motion of all obstacles; `numbers`: of the triangle meshes; the others as for PenaltyContact."""
-        self.group = ObstacleGroup(bodies, numbers, law.distance, self._gap, self._wrench)
+        self.group = ObstacleGroup(bodies, numbers, law.distance, self._gap, self.rank_wrench)
         self._all_meshes = build_mesh_obstacles(self.group, domain.mean_edge_length)
-        # of the last step and of this rank's contacts: force and moment on each, N and N m
-        self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
         self._posed = [bodies.posed[number] for number in numbers]
         for mesh, posed in zip(self._all_meshes, self._posed, strict=True):
             mesh.move_to(posed.pose)
@@ -295,17 +282,17 @@ class PenaltyMeshContact(PenaltyContact):
 
     def accept_step(self) -> None:
         """Store contacts, forces, work and dissipation of the step (collective)."""
-        # work by the trapezoidal rule, as of velocity Verlet
-        last, self._wrenches = self._wrenches, [np.zeros(6) for _ in self.group.numbers]
+        # work by the trapezoidal rule, as of velocity Verlet; with the forces of the last step and of this one
+        last, indices = self._last_wrenches, range(len(self.group.numbers))
+        self.group.forces = [np.zeros(6) if self.is_far() else self.rank_wrench(index) for index in indices]
         super().accept_step()
-        self.group.work = [
-            -0.5 * float((start + end) @ self.group.bodies.increments[number])
-            for start, end, number in zip(last, self._wrenches, self.group.numbers, strict=True)
-        ]
+        items = zip(last, self.group.forces, self.group.increments, strict=True)
+        self.group.work = [-0.5 * float((start + end) @ q) for start, end, q in items]
 
-    def _store_contacts(self, x: Values) -> bool:
-        self._wrenches = [self.rank_wrench(index) for index in range(len(self.group.numbers))]
-        return super()._store_contacts(x)
+    @property
+    def _last_wrenches(self) -> list[Values]:
+        """(6,) forces and moments on obstacles at the end of the last step, N and N m, of this rank's contacts."""
+        return self.group.forces or [np.zeros(6) for _ in self.group.numbers]
 
     def _obstacle_frequency(self, x: Values) -> float:
         # the squares of a body and an obstacle on one spring add up
@@ -314,14 +301,13 @@ class PenaltyMeshContact(PenaltyContact):
             if number not in self.group.bodies.free:
                 continue
             obstacle, posed = cast("VerletObstacle", self.group.bodies.free[number]), self.group.bodies.posed[number]
-            rows: tuple[Values, Values] = np.empty((0, 3)), np.empty(0)
+            springs: tuple[Values, Values] = np.empty((0, 3)), np.empty(0)
             if not part.is_far(x):
                 points = part.points(x)
                 near = part.pairs.near_contacts(points)
-                rows = near.positions(points, np.arange(len(points)) >= len(x)), near.stiffness
-            positions, stiffness = (np.concatenate(arrays) for arrays in zip(*allgather(self.comm, rows), strict=True))
-            if len(stiffness):
-                squares.append(obstacle.max_frequency(obstacle.spring_stiffness(positions, stiffness, posed), posed))
+                springs = near.positions(points, np.arange(len(points)) >= len(x)), near.stiffness
+            stiffness = sum_over_ranks(self.comm, obstacle.spring_stiffness(*springs, posed))
+            squares.append(obstacle.max_frequency(stiffness, posed))
         return max(squares)
 
     # --- contact as the obstacles see it (PoseContact) ---
@@ -341,10 +327,6 @@ class PenaltyMeshContact(PenaltyContact):
 
     # --- readings ---
 
-    def _wrench(self, index: int) -> Values:
-        """(6,) force and moment on an obstacle at the end of the last step, of this rank's contacts, N and N m."""
-        return self._wrenches[index]
-
     def _gap(self, index: int) -> float:
         """Least distance between an obstacle and the body, m, of this rank's points (collective)."""
         if self.state.is_idle():
@@ -361,18 +343,18 @@ class PenaltyMeshContact(PenaltyContact):
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---
 
-    def snapshot(self) -> list[Values]:
-        """Wrenches at the end of the last step."""
-        return self._wrenches
+    def snapshot(self) -> list[Values] | None:
+        """Wrenches at the end of the last step; None: no step yet."""
+        return self.group.forces
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        self._wrenches = cast("list[Values]", memory)
+        self.group.forces = cast("list[Values] | None", memory)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Wrenches at the end of the last step, of all ranks (collective)."""
-        return {"wrenches": sum_over_ranks(self.comm, np.array(self._wrenches))}
+        return {"wrenches": sum_over_ranks(self.comm, np.array(self._last_wrenches))}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint: rank 0 has all of it."""
-        self._wrenches = [wrench * (self.comm.rank == 0) for wrench in saved["wrenches"]]
+        self.group.forces = [wrench * (self.comm.rank == 0) for wrench in saved["wrenches"]]

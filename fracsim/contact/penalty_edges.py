@@ -22,7 +22,7 @@ import numpy as np
 from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
 from .pair_search import SimplexPairs
-from .penalty_law import ContactHistory, ElementRanks, PenaltyContacts
+from .penalty_law import ElementRanks, PenaltyContacts
 from .retractable_surface import unit_normals
 
 
@@ -113,7 +113,7 @@ class EdgeContacts:
         self.candidates = SimplexPairs.of(edges, edges, max_gap)
         self._is_owned: Flags = np.ones(len(ends), bool) if ranks is None else ranks.own(self._sharp.triangles)
 
-    def set_history(self, points: Ints, history: ContactHistory) -> Flags:
+    def set_history(self, points: Ints, history: PenaltyContacts) -> Flags:
         """Set the pairs near each other at the end of the last step; returns (k,) flags of those of this rank.
 
         The lower edge of a pair comes first, and the lower end of an edge, whatever numbers points have: their order
@@ -133,28 +133,27 @@ class EdgeContacts:
     def contacts_within(self, x: Values, pairs: Ints, reach: float) -> PenaltyContacts:
         """Candidates (k, 2) with gaps below `reach`, m, that cross in projection, with points at x (n, 3), m."""
         pairs = pairs[self._is_owned[pairs[:, 0]]]
+        crossing = _CrossingEdges.of(x[self._sharp.ends[pairs].reshape(-1, 4)])
+        pairs = pairs[crossing.cross_in_projection() & (crossing.distance < self._max_gap)]
         ends: Ints = self._sharp.ends[pairs].reshape(-1, 4)
         crossing = _CrossingEdges.of(x[ends])
-        near = np.flatnonzero(crossing.cross_in_projection() & (crossing.distance < self._max_gap))
-        pairs, ends, crossing = pairs[near], ends[near], crossing.select(near)
-        rows = self._row(self._pair_key(pairs))
-        is_stored, history = rows >= 0, self._history.select(rows) if len(self._history.side) else None
-        height = crossing.height
-        side = np.where(height < 0, -1.0, 1.0)
-        side = side if history is None else np.where(is_stored, history.side, side)
-        gap, normal = side * height, side[:, None] * crossing.normal
+        stored = self._row(self._pair_key(pairs))
+        is_stored, history = np.flatnonzero(stored >= 0), self._history.select(stored[stored >= 0])
+        side = np.where(crossing.height < 0, -1.0, 1.0)
+        side[is_stored] = history.side
+        gap, normal = side * crossing.height, side[:, None] * crossing.normal
         first, second = (self._sharp.outward(x, column) for column in pairs.T)
         # the edge a lies in front of b, and b in front of a
-        in_front = (np.einsum("kd,kd->k", second, normal) > 0) & (np.einsum("kd,kd->k", first, normal) < 0)
-        share, share_gradient = crossing.shares()
+        counts = (np.einsum("kd,kd->k", second, normal) > 0) & (np.einsum("kd,kd->k", first, normal) < 0)
+        counts[is_stored] = True
         stiffness = self._stiffness[pairs].min(axis=1) * self._sharp.weight[pairs].prod(axis=1)
+        touched = history.start_stiffness > 0
+        stiffness[is_stored[touched]] = history.stiffness[touched]
         start: Values = np.zeros(len(pairs))
         slip: Values = np.zeros((len(pairs), 3))
-        if history is not None:
-            stiffness = np.where(is_stored & (history.stiffness > 0), history.stiffness, stiffness)
-            start, slip = np.where(is_stored, history.spring_stiffness, 0.0), history.slip * is_stored[:, None]
-        arrays = ends, crossing.weights, gap, normal, stiffness, share, share_gradient, side, slip, start
-        return PenaltyContacts(*arrays).select((is_stored | in_front) & (gap < reach))
+        start[is_stored], slip[is_stored] = history.start_stiffness, history.slip
+        arrays = ends, crossing.weights, gap, normal, stiffness, *crossing.shares(), side, slip, start
+        return PenaltyContacts(*arrays).select(counts & (gap < reach))
 
 
 @dataclass(frozen=True)
@@ -188,11 +187,6 @@ class _CrossingEdges:
         normal = np.cross(a, b) / np.sqrt(determinant)[:, None]
         offset = r + s[:, None] * a - t[:, None] * b
         return cls(a, b, offset, np.stack([s, t], axis=1), normal, np.stack([A, B, C], axis=1))
-
-    def select(self, rows: Ints) -> _CrossingEdges:
-        """Some of the pairs."""
-        arrays = (self.a, self.b, self.offset, self.position, self.normal, self.squares)
-        return _CrossingEdges(*(array[rows] for array in arrays))
 
     def cross_in_projection(self) -> Flags:
         """(k,) whether the closest points lie between the ends of both; never of parallel edges."""

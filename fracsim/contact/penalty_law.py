@@ -20,7 +20,7 @@ Equations: docs/theory.md#explicit-contact.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
@@ -32,16 +32,17 @@ from .laws import slipped, tangential
 
 # weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
 MIN_WEIGHT = 1e-6
-# part of the allowed increase of the square of a frequency that the points at a node may cause
-MAX_ADDED = 0.25
 
 
 @dataclass(frozen=True)
 class PenaltyContacts:
     """Contacts within some gap.
 
+    As a history they are those near each other at the end of the last step: their points have keys, which depend
+    neither on the ranks nor on edges that break, and the start of the step is that of the next one.
+
     Attributes:
-        points: (k, m) numbers of points.
+        points: (k, m) numbers, or keys, of points.
         weights: (k, m) w.
         gap: (k,) m; negative: penetration.
         normal: (k, d) n.
@@ -73,6 +74,24 @@ class PenaltyContacts:
         share, side = np.ones(len(gap)), np.zeros(len(gap))
         return cls(points, weights, gap, normal, stiffness, share, gradient, side, slip, start)
 
+    @classmethod
+    def none(cls, dim: int) -> PenaltyContacts:
+        """No contacts."""
+        none: Values = np.empty(0)
+        points, weights = np.empty((0, 1 + dim), np.int64), np.empty((0, 1 + dim))
+        return cls.of_points(points, weights, none, np.empty((0, dim)), none, np.empty((0, dim)), none)
+
+    def to_array(self) -> Values:
+        """(k, 3 + d) side, stiffness, start stiffness and slip: what a step takes over from the last one."""
+        return np.column_stack([self.side, self.stiffness, self.start_stiffness, self.slip])
+
+    @classmethod
+    def from_array(cls, points: Ints, rows: Values) -> PenaltyContacts:
+        """Contacts of points (k, 1 + d) with rows of `to_array`; gaps and normals, which count no more, are 0."""
+        (side, stiffness, start), slip = rows[:, :3].T, rows[:, 3:]
+        contacts = cls.of_points(points, np.zeros(points.shape), 0 * side, 0 * slip, stiffness, slip, start)
+        return replace(contacts, side=side)
+
     def select(self, rows: Flags | Ints) -> PenaltyContacts:
         """Some of the contacts."""
         return PenaltyContacts(*(getattr(self, field.name)[rows] for field in fields(self)))
@@ -86,6 +105,11 @@ class PenaltyContacts:
     def spring_stiffness(self) -> Values:
         """(k,) k h, N/m."""
         return np.asarray(self.stiffness * self.share)
+
+    @property
+    def spring_energy(self) -> float:
+        """Energy of the springs of friction at the start of the step, J."""
+        return 0.5 * float(self.start_stiffness @ np.sum(self.slip**2, axis=1))
 
     def energy(self, width: float) -> float:
         """Energy with D = `width`, m, J."""
@@ -119,8 +143,6 @@ class PenaltyContacts:
     def added_load(self, nodes: csr_matrix) -> Values:
         """(nodes,) bound of what these contacts add to M omega^2 of each node if all are closed, N/m.
 
-        By the rows of the stiffness matrix (Gershgorin).
-
         Args:
             nodes: (n, nodes) weights with which the first points follow nodes; others do not move.
         """
@@ -128,8 +150,17 @@ class PenaltyContacts:
         rows, columns = np.repeat(np.arange(k), m), self.points.reshape(-1)
         moves = columns < nodes.shape[0]
         entries = self.weights.reshape(-1)[moves], (rows[moves], columns[moves])
-        size = abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes)
-        return np.asarray(size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel()))
+        return stiffness_bound(abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes), self.stiffness)
+
+
+def stiffness_bound(size: csr_matrix, stiffness: Values) -> Values:
+    """(nodes,) bound sum_p |w_pa| k_p sum_b |w_pb| of the rows of K = sum_p k_p w_p w_p^T (Gershgorin), N/m.
+
+    Args:
+        size: (n, nodes) |w| with which springs move with nodes, whatever their directions.
+        stiffness: (n,) k, N/m.
+    """
+    return np.asarray(size.T @ (stiffness * np.asarray(size.sum(axis=1)).ravel()))
 
 
 @dataclass(frozen=True)
@@ -220,68 +251,6 @@ class ElementRanks:
         return np.asarray(self.rank[elements].min(axis=1, initial=np.iinfo(np.int64).max) == self.this)
 
 
-# --- contacts at the end of the last step ---
-
-
-@dataclass(frozen=True)
-class ContactHistory:
-    """Contacts of elements of surfaces near each other at the end of the last step.
-
-    Attributes:
-        points: (k, m) keys of points, which depend neither on the ranks nor on edges that break.
-        values: (k, 3 + d) side, stiffness (0: without contact), share and slip.
-    """
-
-    points: Ints
-    values: Values
-
-    @classmethod
-    def of(cls, near: PenaltyContacts, keys: Ints) -> ContactHistory:
-        """Contacts near each other, whose `start_stiffness` and slip are those to be kept; `keys`: (n,) of points."""
-        stiffness = np.where(near.start_stiffness > 0, near.stiffness, 0.0)
-        return cls(keys[near.points], np.column_stack([near.side, stiffness, near.share, near.slip]))
-
-    @classmethod
-    def none(cls, dim: int) -> ContactHistory:
-        """No contacts."""
-        return cls(np.empty((0, 1 + dim), np.int64), np.empty((0, 3 + dim)))
-
-    def select(self, rows: Flags | Ints) -> ContactHistory:
-        """Some of the contacts."""
-        return ContactHistory(self.points[rows], self.values[rows])
-
-    @classmethod
-    def join(cls, parts: Sequence[ContactHistory]) -> ContactHistory:
-        """Contacts of several ranks."""
-        points = np.concatenate([part.points for part in parts])
-        return cls(points, np.concatenate([part.values for part in parts]))
-
-    @property
-    def side(self) -> Values:
-        """(k,) sign of the normal of edges, 1 or -1; 0: of points before facets."""
-        return self.values[:, 0]
-
-    @property
-    def stiffness(self) -> Values:
-        """(k,) k of those in contact, N/m; 0: without contact."""
-        return self.values[:, 1]
-
-    @property
-    def spring_stiffness(self) -> Values:
-        """(k,) k h, N/m."""
-        return np.asarray(self.values[:, 1] * self.values[:, 2])
-
-    @property
-    def slip(self) -> Values:
-        """(k, d) stretch of the springs of friction, m."""
-        return self.values[:, 3:]
-
-    @property
-    def spring_energy(self) -> float:
-        """Energy of the springs of friction, J."""
-        return 0.5 * float(self.spring_stiffness @ np.sum(self.slip**2, axis=1))
-
-
 @dataclass(frozen=True)
 class Slips:
     """Stretch of the springs of points or facets in contact with a rigid shape, at the end of the last step.
@@ -342,10 +311,8 @@ class ContactStiffness:
 class NodalMassShare:
     """Share of points in the mass of their nodes, and bounds of frequencies of springs at points.
 
-    Points follow nodes by weights w: springs k_p between points and what is at rest are K = sum_p k_p w_p w_p^T. The
-    rows of M^-1 K bound its eigenvalues (Gershgorin), whatever the directions of the springs:
-
-        omega^2  <=  max over nodes a of  1/m_a  sum_p |w_pa| k_p S_p,    S_p = sum_b |w_pb|
+    Points follow nodes by weights w: springs k_p between points and what is at rest are K = sum_p k_p w_p w_p^T, and
+    the square of a frequency is at most the largest row of M^-1 K (`stiffness_bound`).
     """
 
     def __init__(
@@ -359,11 +326,10 @@ class NodalMassShare:
             sum_at_nodes: sums over the ranks of values (nodes,).
         """
         self._size, self._mass, self._sum_at_nodes = abs(weights), mass, sum_at_nodes
-        self._sum = np.asarray(self._size.sum(axis=1)).ravel()
 
     def node_rates(self, stiffness: Values) -> Values:
-        """(nodes,) 1/m_a sum_p |w_pa| k_p S_p, 1/s^2, of k (n,), N/m (collective)."""
-        summed = self._sum_at_nodes(self._size.T @ (stiffness * self._sum))
+        """(nodes,) bounds of the rows of M^-1 K of springs k (n,), N/m; 1/s^2 (collective)."""
+        summed = self._sum_at_nodes(stiffness_bound(self._size, stiffness))
         return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
 
     def point_masses(self, area: Values, local_area: Values | None = None) -> Values:
@@ -373,28 +339,23 @@ class NodalMassShare:
         k_p = A_p cause at the nodes of the point. `local_area`: (n,) share of this rank in `area`; None: all of it.
         """
         rate, entries = self.node_rates(area if local_area is None else local_area), self._size.tocoo()
-        counts = entries.data > MIN_WEIGHT * self._sum[entries.row]
+        counts = entries.data > MIN_WEIGHT * np.asarray(self._size.sum(axis=1)).ravel()[entries.row]
         max_rate = np.zeros(len(area))
         np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
         return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
 
 
 def penalty_stiffness(
-    share: NodalMassShare, area: Values, pressure: float, max_added: float, local_area: Values | None = None
+    share: NodalMassShare, area: Values, rate: float, max_added: float, local_area: Values | None = None
 ) -> Values:
-    """(n,) stiffness k_p of points, N/m (collective).
-
-    `pressure` on half the area of each point, as the other side acts too. At most what adds `max_added` to the square
-    of a frequency where each node is in contact with as many points as it carries.
+    """(n,) stiffness k_p of points, N/m: that of their areas, and at most what their masses leave (collective).
 
     Args:
         share: of the points in the mass of their nodes.
         area: (n,) m^2.
-        pressure: penalty's stiffness, Pa/m.
-        max_added: 1/s^2; infinite: no limit.
+        rate: stiffness of an area, Pa/m.
+        max_added: what all points may add to the square of a frequency, 1/s^2; infinite: no limit.
         local_area: (n,) share of this rank in `area`, m^2; None: all of it.
     """
-    stiffness = 0.5 * pressure * area
-    if np.isinf(max_added):
-        return stiffness
-    return np.minimum(stiffness, MAX_ADDED * max_added * share.point_masses(area, local_area))
+    stiffness = rate * area
+    return stiffness if np.isinf(max_added) else np.minimum(stiffness, max_added * share.point_masses(area, local_area))

@@ -1,6 +1,6 @@
 """Free obstacles in explicit steps: penalty and Coulomb friction before other obstacles, and velocity Verlet.
 
-    analytic obstacles        at inset points of each before the other (obstacle_pairs)
+    analytic obstacles        at inset points of each before the other (inset_points)
     two triangle meshes       points before facets, and sharp edges, of both (penalty_pairs)
 
 Both obstacles have equal and opposite forces at the same points, so that momenta are constant to round-off. Friction
@@ -23,7 +23,7 @@ from .inset_points import SAMPLES
 from .laws import Penalty
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
 from .obstacle_pairs import Numbers, ObstaclePair
-from .penalty_law import ContactHistory, ContactStiffness, PenaltyContacts, PenaltyForces, Slips
+from .penalty_law import ContactStiffness, PenaltyContacts, PenaltyForces, Slips
 from .pose import Pose, PosedShape, resultant
 from .rigid_obstacles import RigidObstacles
 from .triangle_mesh_shape import TriangleMeshShape
@@ -68,75 +68,102 @@ class PairForces:
     friction: Values
     energies: Values
 
-    @classmethod
-    def none(cls, dim: int) -> PairForces:
-        """No forces."""
-        p = 3 if dim == 2 else 6
-        return cls(np.zeros((2, p)), np.zeros((2, p)), np.zeros(2))
 
-    @classmethod
-    def of(cls, forces: PenaltyForces, press: Values, friction: Values) -> PairForces:
-        """Forces of contacts, with wrenches (2, p) of normal forces and of friction, N and N m."""
-        energies = forces.contacts.energy(forces.width), forces.spring_energy
-        return cls(press + friction, friction, np.array(energies))
+@dataclass(frozen=True)
+class NearContacts:
+    """Contacts of two obstacles that may act a step later.
+
+    Attributes:
+        contacts: contacts, whose weights are positive or negative on all points of the first.
+        x: (n, d) points that they refer to, m: those of the first, then those of the second.
+        first_count: number of points of the first.
+        keys: (k,) names of the contacts.
+    """
+
+    contacts: PenaltyContacts
+    x: Values
+    first_count: int
+    keys: Ints
+
+    @property
+    def is_first(self) -> Flags:
+        """(n,) flags of the points of the first."""
+        return np.arange(len(self.x)) < self.first_count
+
+    def positions(self) -> Values:
+        """(k, d) positions of the contacts on the first, m."""
+        return self.contacts.positions(self.x, self.is_first)
+
+    def forces(self, starts: Poses, ends: Poses, friction: float, width: float) -> PenaltyForces:
+        """Forces below the gap `width`, m, after a step with poses at its start and end."""
+        contacts = self.contacts.select(self.contacts.gap < width)
+        sides = zip(starts, ends, (self.x[: self.first_count], self.x[self.first_count :]), strict=True)
+        start_x = np.concatenate([start.points_to_space(end.to_body(x)) for start, end, x in sides])
+        return PenaltyForces(contacts, contacts.relative(self.x - start_x), friction, width, len(self.x))
+
+    def wrenches(self, forces: PenaltyForces, poses: Poses) -> PairForces:
+        """Forces and moments of contacts on both.
+
+        Friction acts on both at one point, in the middle of the gap, so that it has no moment.
+        """
+        press, is_first, contacts = forces.normal_force, self.is_first, forces.contacts
+        pressed = press.any(axis=1)
+        normal = [
+            resultant(press[side], self.x[side] - pose.centre)
+            for side, pose in zip((pressed & is_first, pressed & ~is_first), poses, strict=True)
+        ]
+        middle = 0.5 * (contacts.positions(self.x, is_first) + contacts.positions(self.x, ~is_first))
+        on_first = np.sum(contacts.weights * is_first[contacts.points], axis=1)[:, None] * forces.spring_force
+        friction = [
+            resultant(sign * on_first, middle - pose.centre) for sign, pose in zip((1.0, -1.0), poses, strict=True)
+        ]
+        energies = np.array([contacts.energy(forces.width), forces.spring_energy])
+        return PairForces(np.add(normal, friction), np.array(friction), energies)
 
 
 class InsetPointContacts:
     """Contacts at the inset points of two obstacles of which one at least is analytic.
 
-    Friction acts on the surface of the point's obstacle, where this is nearest to the other one.
+    Both have the contact at the same place: on the surface of the point's obstacle, where it is nearest to the other.
+
+    Attributes:
+        width: gap below which the penalty acts, m.
+        history: springs at the end of the last step.
     """
 
     def __init__(self, pair: ObstaclePair, penalty: Penalty) -> None:
-        self._pair, self._penalty = pair, penalty
-        self._slips = Slips.none(pair.points[0].points.shape[1])
+        self._pair, self._rate, self.width = pair, penalty.rate, penalty.width
+        self.history = Slips.none(pair.points[0].points.shape[1])
 
-    def _near_contacts(self, poses: Poses, max_gap: float) -> tuple[PenaltyContacts, Values, Ints] | None:
-        """Contacts with gaps below `max_gap`, m, with normals on the first; positions (k, d), m, and numbers (k,)."""
-        if self._pair.gap_bound(*poses) >= max_gap:
+    def near_contacts(self, poses: Poses) -> NearContacts | None:
+        """Contacts that may act a step later; None: they are too far apart."""
+        reach = PAIR_PENALTY.near_gap * self.width
+        if self._pair.gap_bound(*poses) >= reach:
             return None
         parts, count = [], 0
         for sign, inset, (x, target) in zip((1.0, -1.0), self._pair.points, self._pair.sides(*poses), strict=True):
             gap = target.distance(x)
-            near = np.flatnonzero(gap < max_gap)
-            normal, k = target.normal(x[near]), self._penalty.rate * inset.areas[near]
+            near = np.flatnonzero(gap < reach)
+            normal, k = target.normal(x[near]), self._rate * inset.areas[near]
             parts.append((count + near, gap[near], sign * normal, x[near] - inset.radius * normal, k))
             count += len(x)
         numbers, gap, normal, position, stiffness = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        if not len(numbers):
-            return None
-        slip, touched = self._slips.at(numbers)
-        rows, ones, start = np.arange(len(numbers))[:, None], np.ones((len(numbers), 1)), stiffness * touched
-        return PenaltyContacts.of_points(rows, ones, gap, normal, stiffness, slip, start), position, numbers
+        slip, touched = self.history.at(numbers)
+        rows = np.arange(2 * len(numbers)).reshape(2, -1).T
+        weights = np.tile([1.0, -1.0], (len(numbers), 1))
+        contacts = PenaltyContacts.of_points(rows, weights, gap, normal, stiffness, slip, stiffness * touched)
+        return NearContacts(contacts, np.tile(position, (2, 1)), len(position), numbers)
 
-    def end_step(self, starts: Poses, ends: Poses) -> tuple[PenaltyForces, Values, Values] | None:
-        """Forces at the end of a step, whose springs are stored, and (2, p) wrenches of normal forces and of friction.
-
-        None: out of contact.
-        """
-        width, near = self._penalty.width, self._near_contacts(ends, self._penalty.width)
+    def end_step(self, near: NearContacts | None, slips: Values) -> None:
+        """Store the springs of a step: stretch (k, d) of those of contacts below the width, m."""
         if near is None:
-            self._slips = Slips.none(ends[0].dim)
-            return None
-        contacts, x, numbers = near
-        first, second = (x - start.points_to_space(end.to_body(x)) for start, end in zip(starts, ends, strict=True))
-        forces = PenaltyForces(contacts, first - second, self._pair.friction, width, len(x))
-        self._slips = Slips(numbers, forces.slips)
-        return forces, _wrenches(forces.normal_force, x, ends), _wrenches(forces.friction_force, x, ends)
-
-    def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
-        """Positions (k, d), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
-        near = self._near_contacts(poses, PAIR_PENALTY.near_gap * self._penalty.width)
-        return None if near is None else (near[1], near[0].stiffness)
-
-    @property
-    def history(self) -> Slips:
-        """Springs at the end of the last step."""
-        return self._slips
+            self.history = Slips.none(self.history.slip.shape[1])
+        else:
+            self.history = Slips(near.keys[near.contacts.gap < self.width], slips)
 
     def set_history(self, history: Slips) -> None:
         """Set the springs at the end of the last step."""
-        self._slips = history
+        self.history = history
 
 
 class MeshContacts:
@@ -154,6 +181,7 @@ class MeshContacts:
         start = self._part.points(self._first.positions_at(first.posed_at(0.0).pose), second.posed_at(0.0).pose)
         if (gap := self._part.pairs.min_gap(start)) < penalty.width:
             self._part = self._build_part(penalty.rate, PAIR_PENALTY.gap_share * gap)
+        self.width, self.set_history = self._part.pairs.width, self._part.pairs.set_history
 
     def _build_part(self, rate: float, width: float) -> SurfacePart[PenaltyPairs]:
         """Contact of the meshes; each side has one half of the penalty's `rate`, Pa/m."""
@@ -169,54 +197,28 @@ class MeshContacts:
         pairs = PenaltyPairs(points, triangles, stiffness, distance=width, patch=patch)
         return SurfacePart(pairs, first.triangles, PAIR_PENALTY.near_gap * width, second.friction, second)
 
-    def _near_positions(self, poses: Poses) -> Values | None:
-        """(n, 3) points of both obstacles, m; None: they are too far apart."""
+    def near_contacts(self, poses: Poses) -> NearContacts | None:
+        """Contacts that may act a step later; None: they are too far apart."""
         first, second = poses
         if self._first.spheres_are_far(first, self._second, second, self._part.reach):
             return None
         self._second.move_to(second)
-        x = self._first.positions_at(first)
-        return None if self._part.is_far(x) else self._part.points(x)
+        positions = self._first.positions_at(first)
+        if self._part.is_far(positions):
+            return None
+        x = self._part.points(positions)
+        contacts = self._part.pairs.near_contacts(x)
+        return NearContacts(contacts, x, len(positions), contacts.points[:, 0])
+
+    def end_step(self, near: NearContacts | None, slips: Values) -> None:
+        """Store the contacts of a step, and stretch (k, d) of the springs of those below the width, m."""
+        if near is not None:
+            self._part.pairs.end_step(near.x, slips)
 
     @property
-    def _is_first(self) -> Flags:
-        """(n,) flags of the points of the first among those of both."""
-        return np.arange(len(self._part.pairs.keys)) < len(self._first.points)
-
-    def end_step(self, starts: Poses, ends: Poses) -> tuple[PenaltyForces, Values, Values] | None:
-        """Forces at the end of a step, whose contacts are stored, and wrenches; as of InsetPointContacts."""
-        if (x := self._near_positions(ends)) is None:
-            return None
-        pairs, is_first, n = self._part.pairs, self._is_first, len(self._first.points)
-        start = self._part.points(self._first.positions_at(starts[0]), starts[1])
-        forces = pairs.forces(x, start, self._part.friction)
-        contacts, press = forces.contacts, forces.normal_force
-        of_press = [
-            resultant(press[rows], x[rows] - pose.centre)
-            for rows, pose in zip((slice(n), slice(n, None)), ends, strict=True)
-        ]
-        # at one point, in the middle of the gap, so that friction has no moment
-        middle = 0.5 * (contacts.positions(x, is_first) + contacts.positions(x, ~is_first))
-        sign = np.sum(contacts.weights * is_first[contacts.points], axis=1)
-        friction = _wrenches(sign[:, None] * forces.spring_force, middle, ends)
-        pairs.end_step(x, forces.slips)
-        return forces, np.array(of_press), friction
-
-    def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
-        """Positions (k, 3), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
-        if (x := self._near_positions(poses)) is None:
-            return None
-        near = self._part.pairs.near_contacts(x)
-        return (near.positions(x, self._is_first), near.stiffness) if len(near.gap) else None
-
-    @property
-    def history(self) -> ContactHistory:
+    def history(self) -> PenaltyContacts:
         """Contacts at the end of the last step."""
         return self._part.pairs.history
-
-    def set_history(self, history: ContactHistory) -> None:
-        """Set the contacts at the end of the last step."""
-        self._part.pairs.set_history(history)
 
 
 class PenaltyPair:
@@ -255,7 +257,8 @@ class PenaltyPair:
         self.contacts: Any = (
             MeshContacts(first, second, penalty) if all(are_meshes) else InsetPointContacts(pair, penalty)
         )
-        self.forces = self._none = PairForces.none(len(first.start_point))
+        self._friction, none = pair.friction, np.zeros((2, 3 if len(first.start_point) == 2 else 6))
+        self.forces = self._none = PairForces(none, none, np.zeros(2))
         self.dissipated, self.work = 0.0, (0.0, 0.0)
 
     def poses(self, posed: Sequence[PosedShape]) -> Poses:
@@ -264,10 +267,13 @@ class PenaltyPair:
 
     def end_step(self, starts: Sequence[PosedShape], ends: Sequence[PosedShape], increments: Sequence[Values]) -> None:
         """Take over the forces of the end of a step, with poses at its start and end, and increments (p,) between."""
-        start, evaluated = self.forces, self.contacts.end_step(self.poses(starts), self.poses(ends))
-        self.forces = self._none if evaluated is None else PairForces.of(*evaluated)
-        start_energy = float(start.energies[1])
-        self.dissipated = start_energy if evaluated is None else evaluated[0].dissipated(start_energy)
+        start, end_poses, slips = self.forces, self.poses(ends), np.empty(0)
+        self.forces, self.dissipated = self._none, float(start.energies[1])
+        if (near := self.contacts.near_contacts(end_poses)) is not None:
+            forces = near.forces(self.poses(starts), end_poses, self._friction, self.contacts.width)
+            self.forces, slips = near.wrenches(forces, end_poses), forces.slips
+            self.dissipated = forces.dissipated(self.dissipated)
+        self.contacts.end_step(near, slips)
         q = np.array([increments[number] for number in self.numbers])
         first, second = np.einsum("bp,bp->b", start.wrenches + self.forces.wrenches, q) / 2
         self.work = float(first), float(second)
@@ -352,9 +358,9 @@ class VerletRigidObstacles(RigidObstacles):
         """
         sums = dict.fromkeys(self.free, 0.0)
         for pair in self._pairs:
-            springs: tuple[Values, Values] | None = pair.contacts.near_springs(pair.poses(self.posed))
-            if springs is None:
+            if (near := pair.contacts.near_contacts(pair.poses(self.posed))) is None:
                 continue
+            springs = near.positions(), near.contacts.stiffness
             squares = {
                 number: obstacle.max_frequency(obstacle.spring_stiffness(*springs, posed), posed)
                 for number in pair.numbers
@@ -380,8 +386,3 @@ class VerletRigidObstacles(RigidObstacles):
         by_prescribed = -sum(work for number, work in items if number not in self.free)
         by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
         return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)
-
-
-def _wrenches(force: Values, x: Values, poses: Poses) -> Values:
-    """(2, p) force and moment on both of forces (k, d) on the first at points x (k, d), N and N m."""
-    return np.array([resultant(sign * force, x - pose.centre) for sign, pose in zip((1.0, -1.0), poses, strict=True)])

@@ -30,11 +30,11 @@ from ..mesh.ghost_exchange import KeyLookup, find_saved_keys
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
 from ..meshes.topology import row_keys
 from .facet_contact import ContactFacets
-from .laws import ObstacleLaw
+from .laws import ObstacleLaw, Penalty
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips
+from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips, penalty_stiffness
 from .pose import PosedShape
 from .rigid_obstacles import RigidObstacles
 
@@ -60,13 +60,13 @@ class StepEnd:
     """Contact at the end of a step.
 
     Attributes:
-        slips: of points, and of facets, in contact with each obstacle.
+        slips: of points and facets in contact with each obstacle.
         forces: (d,) sum of the forces of each obstacle on the body, N.
         spring_energy: of all springs, J.
         all_far: whether the body is known to be far from all obstacles.
     """
 
-    slips: list[list[Slips]]
+    slips: list[Slips]
     forces: list[Values]
     spring_energy: float = 0.0
     all_far: bool = False
@@ -109,11 +109,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         self._mass, self._max_added = mass, max_added
         dim, count = domain.dim, len(numbers)
-        none = Slips.none(dim)
-        self._step_end = StepEnd([[none, none]] * count, [np.zeros(dim)] * count)
+        self._step_end = StepEnd([Slips.none(dim)] * count, [np.zeros(dim)] * count)
         self._start_points: Values | None = None  # (n, d) at the start of a step that is not accepted yet, m
-        # of each obstacle at the current u: forces on points and on facets, and the keys of these
-        self._parts: list[list[tuple[PenaltyForces, Ints]]] = [[]] * count
+        self._touching: dict[int, tuple[PenaltyForces, Ints]] = {}  # at the current u, and keys of the contacts
         super().__init__(domain, u, bodies, numbers, law)
         self._update_stiffness()
 
@@ -128,12 +126,15 @@ class PenaltyObstacleTerm(ObstacleTerm):
         point_map, area = self.surface.point_map, self.surface.area
         mass = self.surface.nodal_values(self._mass)[:, 0].copy()
         self._mass_share = mass_share = NodalMassShare(point_map.weights, mass, self._sum_at_nodes)
-        self.stiffness: Values = self.law.barrier.curvature(np.zeros(len(area))) * area
-        if np.isfinite(self._max_added):
-            self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
+        self.stiffness: Values = penalty_stiffness(mass_share, area, self._penalty_rate, self._max_added)
         self._added_frequency, self._stiffness_of = self._max_rate(self.stiffness), (point_map, area)
         if self.surface.curved:
             self._update_facets()
+
+    @property
+    def _penalty_rate(self) -> float:
+        """Stiffness of an area, Pa/m."""
+        return cast("Penalty", self.law.barrier).rate
 
     def _sum_at_nodes(self, values: Values) -> Values:
         """(columns,) sums over the ranks of values (columns,) at the nodes of the points (collective)."""
@@ -149,7 +150,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """Compute the stiffness k_f of facets off crack faces, kept as areas of ContactFacets (collective)."""
         surface, is_copy = self.surface, np.zeros(len(self.surface.area), bool)
         is_copy[surface.point_map.copies] = True
-        facets, k = self.surface.facets, self.law.barrier.curvature(np.zeros(1)) * self.surface.facets.area
+        facets, k = self.surface.facets, self._penalty_rate * self.surface.facets.area
         if np.isfinite(self._max_added):
             masses = self._mass_share.point_masses(surface.area)
             per_mass = np.divide(surface.area, masses, out=np.zeros(len(masses)), where=masses > 0)
@@ -181,17 +182,11 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
         posed, reach = self.group.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
-        parts, d = self._contacts(self.group.numbers.index(number), posed, reach), self._domain.dim
-        x = np.concatenate([contacts.relative(self.positions) for contacts, _ in parts] or [np.empty((0, d))])
-        stiffness = obstacle.spring_stiffness(x, np.concatenate([contacts.stiffness for contacts, _ in parts]), posed)
-        return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
+        near, _ = self._contacts(self.group.numbers.index(number), posed, reach)
+        stiffness = obstacle.spring_stiffness(near.relative(self.positions), near.stiffness, posed)
+        return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness), posed)
 
     # --- steps ---
-
-    def update_displacement(self) -> None:
-        """Discard forces, and test whether obstacles are far while u is in the cache (collective)."""
-        super().update_displacement()
-        self.is_far()
 
     def is_far(self) -> bool:
         """Whether nothing is in contact at the current u, nor was at the end of the last step (collective)."""
@@ -213,42 +208,43 @@ class PenaltyObstacleTerm(ObstacleTerm):
             self._update_stiffness()
         self._start_points = self.surface.positions(self.level.u_n)
 
-    def _contacts(self, number: int, posed: PosedShape, reach: float) -> list[tuple[PenaltyContacts, Ints]]:
-        """Points nearer than `reach`, m, to an obstacle, and facets that may be, and their keys."""
+    def _contacts(self, number: int, posed: PosedShape, reach: float) -> tuple[PenaltyContacts, Ints]:
+        """Points nearer than `reach`, m, to an obstacle, and facets that may be, and their keys.
+
+        Where facets count, a point is one whose first corner carries all.
+        """
         x, names = self.positions, self.surface.keys
         points = self.point_candidates(posed, x, reach)
         gap = posed.distance(x[points])
         near = (gap < reach) & (self.surface.area[points] > 0)
         points, gap = points[near], gap[near]
-        ones: Values = np.ones((len(points), 1))
-        items = [(points[:, None], ones, gap, posed.normal(x[points]), self.stiffness[points])]
+        keys, normal, stiffness = names[points], posed.normal(x[points]), self.stiffness[points]
+        corners: Ints = points[:, None]
+        weights: Values = np.ones((len(points), 1))
         if number in self.surface.curved:
             facets = self._facets.within_reach(posed, x, reach)
-            closest = self._facets.closest_points(posed, x, facets)
-            geometry = self._facets.corners[facets], closest.barycentric, closest.gap, closest.normal
-            items.append((*geometry, self._facets.area[facets]))
-        result = []
-        for item, slips in zip(items, self._step_end.slips[number], strict=False):
-            members, stiffness = item[0], item[-1]
-            keys = row_keys(np.sort(names[members], axis=1)) if members.shape[1] > 1 else names[members[:, 0]]
-            slip, touched = slips.at(keys)
-            result.append((PenaltyContacts.of_points(*item, slip, stiffness * touched), keys))
-        return result
+            of_facets, closest = self._facets.corners[facets], self._facets.closest_points(posed, x, facets)
+            c = of_facets.shape[1]
+            keys = np.append(keys, row_keys(np.sort(names[of_facets], axis=1)))
+            corners = np.concatenate([np.repeat(corners, c, axis=1), of_facets])
+            weights = np.concatenate([np.tile(np.eye(1, c), (len(points), 1)), closest.barycentric])
+            gap, stiffness = np.append(gap, closest.gap), np.append(stiffness, self._facets.area[facets])
+            normal = np.concatenate([normal, closest.normal])
+        slip, touched = self._step_end.slips[number].at(keys)
+        contacts = PenaltyContacts.of_points(corners, weights, gap, normal, stiffness, slip, stiffness * touched)
+        return contacts, keys
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose."""
         width, friction = self.law.barrier.width, self.group.obstacles[number].friction
-        touching = [(near.select(touches := near.gap < width), keys[touches])
-                    for near, keys in self._contacts(number, posed, width)]  # fmt: skip
-        points = np.unique(np.concatenate([contacts.points.reshape(-1) for contacts, _ in touching]))
-        self._parts[number] = parts = []
-        for contacts, keys in touching:
-            motion, rows = self._relative_motion(number, contacts), np.searchsorted(points, contacts.points)
-            forces = PenaltyForces(replace(contacts, points=rows), motion, friction, width, len(points))
-            parts.append((forces, keys))
-        normal = np.sum([forces.normal_force for forces, _ in parts], axis=0)
-        rub = np.sum([forces.friction_force for forces, _ in parts], axis=0)
-        return ContactForces(points, sum(forces.energy for forces, _ in parts), normal, rub, 0.0, _no_tangent)
+        near, keys = self._contacts(number, posed, width)
+        touches = near.gap < width
+        contacts = near.select(touches)
+        points, rows = np.unique(contacts.points, return_inverse=True)
+        numbered = replace(contacts, points=rows.reshape(contacts.points.shape))
+        forces = PenaltyForces(numbered, self._relative_motion(number, contacts), friction, width, len(points))
+        self._touching[number] = forces, keys[touches]
+        return ContactForces(points, forces.energy, forces.normal_force, forces.friction_force, 0.0, _no_tangent)
 
     def _relative_motion(self, number: int, contacts: PenaltyContacts) -> Values:
         """(k, d) motion of contacts relative to an obstacle in the step, m; zero once the step is accepted."""
@@ -265,15 +261,14 @@ class PenaltyObstacleTerm(ObstacleTerm):
             self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(zeros), zeros
             return
         forces = [-self._current_force(number) for number in range(len(self.group.obstacles))]
-        previous, group, all_parts = self._step_end, self.group, [part for parts in self._parts for part, _ in parts]
+        previous, group, touching = self._step_end, self.group, [self._touching[n] for n in range(len(forces))]
         group.forces = [-force for force in forces]
-        group.friction_loss = previous.spring_energy + sum(part.dissipated(0.0) for part in all_parts)
+        group.friction_loss = previous.spring_energy + sum(part.dissipated(0.0) for part, _ in touching)
         for number in (number for number, obstacle in enumerate(self.group.obstacles) if not obstacle.free):
             shift = self.group.increments[number][: self._domain.dim]
             group.work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
-        slips = [[Slips(keys, part.slips) for part, keys in parts] for parts in self._parts]
-        slips = [new + old[len(new) :] for new, old in zip(slips, previous.slips, strict=True)]
-        energy = sum(part.spring_energy for part in all_parts)
+        slips = [Slips(keys, part.slips) for part, keys in touching]
+        energy = sum(part.spring_energy for part, _ in touching)
         self._step_end, self._start_points = StepEnd(slips, forces, energy, self._ends_far()), None
 
     # --- state ---
@@ -302,20 +297,18 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint, on rank 0 (collective).
 
-        Of springs: keys, and rows of obstacle, kind and stretch. Ranks that share a point have the same spring there.
+        Of springs: keys, and rows of obstacle and stretch. Ranks that share a point have the same spring there.
         Points and facets that do not exist any more, since edges broke after the step, have none.
         """
         end, exists = self._step_end, KeyLookup(self._spring_keys())
         sums = sum_over_ranks(self.comm, np.append(np.array(end.forces).reshape(-1), end.spring_energy))
-        numbered = [(number, kind, slips) for number, kinds in enumerate(end.slips) for kind, slips in enumerate(kinds)]
-        rows = [np.column_stack([np.tile([number, kind], (len(slips.keys), 1)), slips.slip])
-                for number, kind, slips in numbered]  # fmt: skip
-        keys = np.concatenate([slips.keys for *_, slips in numbered])
+        rows = np.concatenate([np.insert(slips.slip, 0, number, axis=1) for number, slips in enumerate(end.slips)])
+        keys = np.concatenate([slips.keys for slips in end.slips])
         which = exists(keys) >= 0
-        if (gathered := gather(self.comm, (keys[which], np.concatenate(rows)[which]))) is None:
+        if (gathered := gather(self.comm, (keys[which], rows[which]))) is None:
             return {}
         all_keys, all_rows = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
-        _, first = np.unique(np.column_stack([all_rows[:, :2], all_keys]), axis=0, return_index=True)
+        _, first = np.unique(np.column_stack([all_rows[:, 0], all_keys]), axis=0, return_index=True)
         return {"spring_points": all_keys[first], "springs": all_rows[first], "pushed": sums}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
@@ -324,11 +317,10 @@ class PenaltyObstacleTerm(ObstacleTerm):
         Raises ValueError if it has keys of no element.
         """
         find_saved_keys(self.comm, self._spring_keys(), saved["spring_points"])
-        rows, keys, is_root = saved["springs"], saved["spring_points"], self.comm.rank == 0
+        rows, keys, is_root = saved["springs"], saved["spring_points"].astype(np.int64), self.comm.rank == 0
         *forces, energy = saved["pushed"] * is_root
-        selected = [[(rows[:, :2] == (number, kind)).all(axis=1) for kind in range(2)]
-                    for number in range(len(self.group.obstacles))]  # fmt: skip
-        slips = [[Slips(keys[which].astype(np.int64), rows[which, 2:]) for which in kinds] for kinds in selected]
+        selected = [rows[:, 0] == number for number in range(len(self.group.obstacles))]
+        slips = [Slips(keys[which], rows[which, 1:]) for which in selected]
         self._step_end = StepEnd(slips, list(np.reshape(forces, (len(slips), -1))), float(energy))
 
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
-from .closest_point import minimise_on_simplex
+from .closest_point import closest_points_of_facets
 from .pair_search import (
     PairFilter,
     PairSearch,
@@ -32,7 +32,7 @@ from .pair_search import (
     pair_distances,
 )
 from .penalty_edges import EdgeContacts
-from .penalty_law import ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
+from .penalty_law import ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
 from .retractable_surface import unit_normals
 
 
@@ -91,7 +91,7 @@ class PointFacetContacts:
         self._points = used[owned]
         self.candidates = SimplexPairs.of(owned[:, None], facets.reshape(elements.shape), self._max_gap)
 
-    def set_history(self, points: Ints, history: ContactHistory) -> Flags:
+    def set_history(self, points: Ints, history: PenaltyContacts) -> Flags:
         """Set the contacts at the end of the last step; returns (k,) flags of those of points of this rank.
 
         `points`: (k, 1 + d) their numbers; -1: a point that is no more.
@@ -104,7 +104,7 @@ class PointFacetContacts:
         self._facets[point], self._slip[point] = np.column_stack(facet), stored.slip
         self._start_stiffness: Values = np.zeros(count)
         # edges that broke may have left less of a point
-        self._start_stiffness[point] = np.minimum(stored.stiffness, self._stiffness.limit[point])
+        self._start_stiffness[point] = np.minimum(stored.start_stiffness, self._stiffness.limit[point])
         return is_own
 
     def contacts_within(self, x: Values, pairs: Ints, reach: float) -> PenaltyContacts:
@@ -114,7 +114,7 @@ class PointFacetContacts:
         side of the point. Of equally near facets the first one counts, whatever round-off.
         """
         points, corners = self._points[pairs[:, 0]], self._elements[pairs[:, 1]]
-        barycentric, offset = _closest_points(x, points, corners)
+        barycentric, offset = closest_points_of_facets(x[points], x[corners])
         distance = np.linalg.norm(offset, axis=1)
         near = np.flatnonzero(distance < self._max_gap)
         near_normal = unit_normals(x[corners[near]])
@@ -170,16 +170,6 @@ def _first_rows(groups: Ints, rows: Ints) -> Ints:
     return rows[order[np.unique(groups[order], return_index=True)[1]]]
 
 
-def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Values]:
-    """(k, d) barycentric coordinates of closest points, and vectors (k, d) from there to the points, m."""
-    k, d = corners.shape
-    arms = x[corners] - x[points][:, None]
-    centroid = np.full((k, d), 1 / d)
-    slope = np.einsum("kcd,kd->kc", arms, arms.mean(axis=1))
-    barycentric = minimise_on_simplex(arms @ arms.transpose(0, 2, 1), slope, centroid)
-    return barycentric, -np.einsum("kcd,kc->kd", arms, barycentric)
-
-
 class PenaltyPairs:
     """Penalty between the elements of a surface; x is always (n, d), m.
 
@@ -189,7 +179,7 @@ class PenaltyPairs:
         history: contacts of this rank near each other at the end of the last step.
     """
 
-    history: ContactHistory
+    history: PenaltyContacts
 
     def __init__(
         self,
@@ -233,15 +223,14 @@ class PenaltyPairs:
         # steps are short: once a vertex has moved by more than the margin, others will have soon, and all are searched
         self._search = PairSearch(where, self._sets, PAIRS.search_margin * distance, max_moved=0.0)
         self._near: tuple[Values, PenaltyContacts] | None = None  # of the last x
-        self._touching: PenaltyContacts | None = None  # those of them in contact
-        self.set_history(ContactHistory.none(dim))
+        self.set_history(PenaltyContacts.none(dim))
 
-    def set_history(self, history: ContactHistory) -> None:
-        """Set the contacts at the end of the last step; those of other ranks are left out."""
-        self._near = self._touching = None
+    def set_history(self, history: PenaltyContacts) -> None:
+        """Set the contacts at the end of the last step, by keys of points; those of other ranks are left out."""
+        self._near = None
         self._set_history(history)
 
-    def _set_history(self, history: ContactHistory) -> None:
+    def _set_history(self, history: PenaltyContacts) -> None:
         numbers, of_edges = self._number(history.points), history.side != 0
         is_own = np.zeros(len(of_edges), bool)
         for kind, rows in zip(self._kinds, (~of_edges, of_edges), strict=False):
@@ -261,19 +250,17 @@ class PenaltyPairs:
         return float(self.contacts(x).gap.min(initial=np.inf))
 
     def contacts(self, x: Values) -> PenaltyContacts:
-        """Contacts with points at x; those of the last x are kept."""
+        """Contacts with points at x."""
         near = self.near_contacts(x)
-        if self._touching is None:
-            self._touching = near.select(near.gap < self.width)
-        return self._touching
+        return near.select(near.gap < self.width)
 
     def near_contacts(self, x: Values) -> PenaltyContacts:
         """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
         if self._near is None or not np.array_equal(x, self._near[0]):
             pairs_of_kinds, reach = self._search.pairs(x[self._used]), PAIRS.ahead_gap * self.width
-            items = zip(self._kinds, pairs_of_kinds, strict=True)
-            near = PenaltyContacts.join([kind.contacts_within(x, pairs, reach) for kind, pairs in items])
-            self._near, self._touching = (x.copy(), near), None
+            kinds = zip(self._kinds, pairs_of_kinds, strict=True)
+            near = PenaltyContacts.join([kind.contacts_within(x, pairs, reach) for kind, pairs in kinds])
+            self._near = x.copy(), near
         return self._near[1]
 
     def forces(self, x: Values, start: Values | None = None, friction: float = 0.0) -> PenaltyForces:
@@ -289,8 +276,8 @@ class PenaltyPairs:
         if slips is not None:
             all_slips[touches] = slips
         near = replace(near, slip=all_slips, start_stiffness=np.where(touches, near.spring_stiffness, 0.0))
-        self._near, self._touching = (x.copy(), near), None
-        self._set_history(ContactHistory.of(near, self.keys))
+        self._near = x.copy(), near
+        self._set_history(replace(near, points=self.keys[near.points]))
 
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that intersect with points at x."""
@@ -298,7 +285,7 @@ class PenaltyPairs:
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x."""
-        return bool(self.history.stiffness.any()) or len(self._search.pairs(x[self._used])[0]) > 0
+        return bool(self.history.start_stiffness.any()) or len(self._search.pairs(x[self._used])[0]) > 0
 
     def clearance(self, x: Values) -> float:
         """Distance by which any two points at x may approach before anything is near, m; nothing is near at x."""
@@ -307,8 +294,3 @@ class PenaltyPairs:
             near = near_pairs(pairs, self._search.filter, vertices, vertices, distance)
             distance = float(pair_distances(pairs, near, vertices).min(initial=distance))
         return max(0.0, distance - PAIRS.ahead_gap * self.width)
-
-    def clear_caches(self) -> None:
-        """Discard the candidates of collision detection."""
-        self._near = self._touching = None
-        self._search.clear_caches()

@@ -1,6 +1,6 @@
 """Penalty contact of a body's surface with itself, or with triangle-mesh obstacles, on the elements of a rank.
 
-    PenaltyPart           contacts of the elements of a rank; PenaltyBodySurface: surface of the body on all ranks
+    PenaltyBodySurface    surface of the body on all ranks, and its contacts
     PenaltyState          contacts at the end of the last step, and whether steps are idle
 
 The contact of a point, or of an edge with one that comes later in the order of the surface, belongs to the lowest rank
@@ -27,37 +27,23 @@ from .element_exchange import EXCHANGE, bounding_boxes, motion_diagonals, own_po
 from .mesh_obstacles import MeshObstacle, SurfacePart
 from .partitioned_surface import PartitionedSurface
 from .penalty_law import (
-    ContactHistory,
     ContactStiffness,
     ElementRanks,
     NodalMassShare,
-    PenaltyForces,
+    PenaltyContacts,
     penalty_stiffness,
 )
 from .penalty_pairs import PAIRS, PenaltyPairs
-from .pose import Pose
 from .retractable_surface import RetractableSurface, SelfContactLaw
 from .sample_points import vertex_areas
 
-
-class PenaltyPart(SurfacePart[PenaltyPairs]):
-    """Part with a penalty."""
-
-    def forces(self, x: Values, start: Values | None = None, start_pose: Pose | None = None) -> PenaltyForces:
-        """Forces with the body at x (n, d), m, and at `start` at the start of the step; None: it is accepted."""
-        starts = None if start is None or not self.friction else self.points(start, start_pose)
-        return self.pairs.forces(self.points(x), starts, self.friction)
-
-    def added_load(self, x: Values, weights: csr_matrix) -> Values:
-        """(columns,) bounds of what this rank's contacts add to M omega^2 of each node, N/m.
-
-        `weights`: (n, columns) with which the points of the body follow nodes.
-        """
-        near = None if self.is_far(x) else self.pairs.near_contacts(self.points(x))
-        return np.zeros(weights.shape[1]) if near is None or not len(near.gap) else near.added_load(weights)
+# share of the allowed increase of the square of a frequency that points may cause: a node may be in contact with as
+# many points as it carries, and so may those points
+MAX_ADDED = 0.25
+type PenaltyPart = SurfacePart[PenaltyPairs]  # contact of the body with itself, or with an obstacle
 
 
-class PenaltyBodySurface(PartitionedSurface[PenaltyPart]):
+class PenaltyBodySurface(PartitionedSurface[SurfacePart[PenaltyPairs]]):
     """Contact surface of a body with a penalty."""
 
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
@@ -99,33 +85,32 @@ class PenaltyBodySurface(PartitionedSurface[PenaltyPart]):
         self, surface: RetractableSurface[PenaltyPart], elements: Ints, mesh: MeshObstacle | None
     ) -> PenaltyPart:
         corners, rank = surface.elements[elements], surface.element_set.elements.rank[elements]
-        points, X, distance = surface.element_set.points, surface.rest_positions, self.law.distance
-        k, keys, is_own = points.stiffness, points.keys, surface.own_points
-        this, size = self._comm.rank, self._comm.size
-        if mesh is None:
-            ranks, stiffness = ElementRanks(rank, this, is_own), ContactStiffness.of_one_body(k)
-            pairs = PenaltyPairs(
-                X, corners, stiffness, distance=distance, ranks=ranks if size > 1 else None, edge=self.mean_edge,
-                keys=keys,
-            )  # fmt: skip
-            return PenaltyPart(pairs, corners, distance, self.law.friction)
-        pressure, n, m = self.law.stiffness / distance, len(X), len(mesh.points)
-        reduction = np.divide(k, 0.5 * pressure * points.area, out=np.ones(n), where=points.area > 0)
-        of_mesh = 0.5 * pressure * vertex_areas(mesh.points, mesh.triangles)
-        rigid = ContactStiffness(of_mesh, np.full(m, np.inf), np.ones(m))
-        stiffness = ContactStiffness(k, k, reduction).followed_by(rigid)
-        triangle_ranks = mesh.triangle_ranks(size)
-        is_own = np.append(is_own, own_points(triangle_ranks, mesh.triangles, m, this))
-        ranks = ElementRanks(np.append(rank, triangle_ranks), this, is_own)
+        points, X, is_own = surface.element_set.points, surface.rest_positions, surface.own_points
+        k, keys, this, size, patch = points.stiffness, points.keys, self._comm.rank, self._comm.size, None
+        stiffness, friction, all_elements = ContactStiffness.of_one_body(k), self.law.friction, corners
+        if mesh is not None:
+            n, m, friction = len(X), len(mesh.points), mesh.friction
+            rate = 0.5 * self.law.stiffness / self.law.distance
+            reduction = np.divide(k, rate * points.area, out=np.ones(n), where=points.area > 0)
+            of_mesh = rate * vertex_areas(mesh.points, mesh.triangles)
+            rigid = ContactStiffness(of_mesh, np.full(m, np.inf), np.ones(m))
+            stiffness = ContactStiffness(k, k, reduction).followed_by(rigid)
+            ranks_of_mesh = mesh.triangle_ranks(size)
+            is_own = np.append(is_own, own_points(ranks_of_mesh, mesh.triangles, m, this))
+            rank, X = np.append(rank, ranks_of_mesh), np.concatenate([X, mesh.points])
+            all_elements = np.concatenate([corners, mesh.triangles + n])
+            patch, keys = np.repeat(np.array([0, 1], np.int32), [n, m]), np.append(keys, -1 - np.arange(m))
         pairs = PenaltyPairs(
-            np.concatenate([X, mesh.points]), np.concatenate([corners, mesh.triangles + n]), stiffness,
-            distance=distance, patch=np.repeat(np.array([0, 1], np.int32), [n, m]),
-            ranks=ranks if size > 1 else None, edge=self.mean_edge, keys=np.append(keys, -1 - np.arange(m)),
+            X, all_elements, stiffness, distance=self.law.distance, patch=patch, edge=self.mean_edge, keys=keys,
+            ranks=ElementRanks(rank, this, is_own) if size > 1 else None,
         )  # fmt: skip
-        return PenaltyPart(pairs, corners, distance, mesh.friction, mesh)
+        return SurfacePart(pairs, corners, self.law.distance, friction, mesh)
 
     def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
-        """(n,) stiffness of the points of this rank, N/m: constant while a surface lasts (collective)."""
+        """(n,) stiffness of the points of this rank, N/m: constant while a surface lasts (collective).
+
+        A side has one half of the pressure of an area, as the other one acts too.
+        """
         d, nodes = self._domain.dim, self._own_nodes
         assert nodes is not None
 
@@ -134,9 +119,9 @@ class PenaltyBodySurface(PartitionedSurface[PenaltyPart]):
             return nodes(total)[:, 0].copy()
 
         # before obstacles twice that of self-contact, where both sides yield
-        limit = (2 if self._meshes else 1) * self._max_added
+        limit = (2 if self._meshes else 1) * MAX_ADDED * self._max_added
         mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), nodal_sums)
-        return penalty_stiffness(mass_share, area, self.law.stiffness / self.law.distance, limit, local_area)
+        return penalty_stiffness(mass_share, area, 0.5 * self.law.stiffness / self.law.distance, limit, local_area)
 
     def _moving_points(self, u: Values) -> list[Values]:
         return [*super()._moving_points(u), *(mesh.positions for mesh in self._meshes)]
@@ -153,20 +138,24 @@ class PenaltyBodySurface(PartitionedSurface[PenaltyPart]):
     def _keep_history(self, previous: RetractableSurface[PenaltyPart]) -> None:
         self.set_history([part.pairs.history for part in previous.parts])
 
-    def set_history(self, histories: Sequence[ContactHistory]) -> None:
+    def set_history(self, histories: Sequence[PenaltyContacts]) -> None:
         """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
 
         Collective.
         """
         for part, history in zip(self.current.parts, histories, strict=True):
-            of_all = history if self._comm.size == 1 else ContactHistory.join(allgather(self._comm, history))
+            of_all = history if self._comm.size == 1 else PenaltyContacts.join(allgather(self._comm, history))
             part.pairs.set_history(of_all)
 
     def max_added_frequency(self, x: Values) -> float:
         """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
-        weights, d = self.current.point_map.weights, self._domain.dim
-        loads = [part.added_load(x, weights) for part in self.current.parts]
-        largest = np.zeros(len(loads))
+        weights, d, largest = self.current.point_map.weights, self._domain.dim, np.zeros(len(self.current.parts))
+        loads = [
+            np.zeros(weights.shape[1])
+            if part.is_far(x)
+            else part.pairs.near_contacts(part.points(x)).added_load(weights)
+            for part in self.current.parts
+        ]
         if self._comm.allreduce(bool(np.any(loads)), op=MPI.LOR):
             for part, load in enumerate(loads):
                 total = self.sum_at_nodes(np.repeat(load[:, None], d, axis=1))
@@ -211,7 +200,7 @@ class PenaltyState:
         self._comm, self._dim, self._u, self._owned = domain.comm, domain.dim, u, domain.node_count * domain.dim
         self._surface, self._is_far, self._idle_state = surface, is_far, IdleState()
         # contacts of a snapshot of another surface, to be set when all ranks come together
-        self._restored: list[ContactHistory] | None = None
+        self._restored: list[PenaltyContacts] | None = None
         self.discard()
 
     def discard(self) -> None:
@@ -256,7 +245,7 @@ class PenaltyState:
         self._idle_state = replace(self._idle_state, is_near=any_near)
 
     @property
-    def _histories(self) -> list[ContactHistory]:
+    def _histories(self) -> list[PenaltyContacts]:
         return [part.pairs.history for part in self._surface.current.parts]
 
     def settle(self) -> None:
@@ -272,12 +261,14 @@ class PenaltyState:
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        histories, count, idle = cast("tuple[list[ContactHistory], int, IdleState]", memory)
-        is_same = count == self._surface.surface_count
-        self._restored, self._idle_state = (None, idle) if is_same else (histories, IdleState(idle.is_near))
-        for part, history in zip(self._surface.current.parts, histories, strict=True):
-            if history is not part.pairs.history:
-                part.pairs.set_history(history)
+        histories, count, idle = cast("tuple[list[PenaltyContacts], int, IdleState]", memory)
+        if count == self._surface.surface_count:
+            self._restored, self._idle_state = None, idle
+            for part, history in zip(self._surface.current.parts, histories, strict=True):
+                if history is not part.pairs.history:
+                    part.pairs.set_history(history)
+        else:
+            self._restored, self._idle_state = histories, IdleState(idle.is_near)
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
@@ -285,16 +276,14 @@ class PenaltyState:
         self.settle()
         arrays: dict[str, Values] = {}
         for index, history in enumerate(self._histories):
-            if (rows := gather(self._comm, history)) is not None:
-                of_all = ContactHistory.join(rows)
-                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.values}
+            if (of_ranks := gather(self._comm, history)) is not None:
+                of_all = PenaltyContacts.join(of_ranks)
+                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.to_array()}
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
         names = [(f"points_{index}", f"values_{index}") for index in range(len(self._histories))]
-        histories = [ContactHistory(cast("Ints", saved[points]), saved[values]) for points, values in names]
-        self._idle_state = IdleState(is_near=any(len(history.points) for history in histories))
-        for part, history in zip(self._surface.current.parts, histories, strict=True):
-            part.pairs.set_history(history)
-        self.discard()
+        histories = [PenaltyContacts.from_array(cast("Ints", saved[key]), saved[rows]) for key, rows in names]
+        is_near = any(len(history.points) for history in histories)
+        self.restore((histories, self._surface.surface_count, IdleState(is_near)))
