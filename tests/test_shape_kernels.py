@@ -18,7 +18,6 @@ from fracsim.contact.shape_kernels import CompiledShapeKernels, compile_shape_ke
 from fracsim.contact.shapes import (
     Capsule,
     HalfSpace,
-    OffsetShape,
     RoundedBox,
     RoundedCylinder,
     Shape,
@@ -35,7 +34,7 @@ SHAPES: dict[str, Shape] = {
     "cylinder": RoundedCylinder(0.25, 0.4, 0.05, (1.0, 0.3, -0.2)), "bowl": Sphere(0.3, hollow=True),
     "tank": RoundedCylinder(0.25, 0.4, 0.05, hollow=True),
     "pendulum": TranslatedShape(RoundedBox((0.5, 0.4, 0.3)), np.array([0.1, 0.2, 0.0])),
-    "grown": OffsetShape(TranslatedShape(Capsule(0.1, 0.5), np.array([0.0, 0.1, 0.2])), 0.07),
+    "grown": TranslatedShape(Capsule(0.1, 0.5), np.array([0.0, 0.1, 0.2]), 0.07),
 }  # fmt: skip
 CONVEX = [name for name, shape in SHAPES.items() if shape.convex and name != "grown"]
 WIDTH, SMOOTHING = 0.1, 0.02
@@ -50,7 +49,7 @@ def kernels() -> CompiledShapeKernels:
 
 
 def compiled_shape(shape: Shape, kernels: CompiledShapeKernels) -> Shape:
-    if isinstance(shape, TranslatedShape | OffsetShape):
+    if isinstance(shape, TranslatedShape):
         return cast("Shape", replace(cast("Any", shape), shape=compiled_shape(shape.shape, kernels)))
     return kernels.used_for(shape)
 
@@ -58,7 +57,7 @@ def compiled_shape(shape: Shape, kernels: CompiledShapeKernels) -> Shape:
 def posed_pair(name: str, kernels: CompiledShapeKernels) -> tuple[PosedShape, PosedShape]:
     """The same shape at the same pose by array code, and compiled."""
     shape, rng = SHAPES[name], np.random.default_rng(3)
-    d = len(shape.normal(np.zeros((1, 3)))[0]) if isinstance(shape, OffsetShape) else shape.dim
+    d = shape.dim
     pose = Pose.at_point(rng.normal(size=d)).incremented(rng.normal(size=3 if d == 2 else 6))
     return PosedShape(shape, pose), PosedShape(compiled_shape(shape, kernels), pose)
 

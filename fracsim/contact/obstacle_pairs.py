@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +30,7 @@ from .node_contact import (
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape, point_jacobian
 from .shape_base import Shape
-from .shapes import OffsetShape
+from .shapes import TranslatedShape
 from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
 
@@ -110,12 +110,12 @@ class ObstaclePair:
     def between(cls, body: RigidObstacle, obstacle: RigidObstacle) -> ObstaclePair:
         """Pair of two obstacles."""
         first, second = inset_points(body.shape), inset_points(obstacle.shape)
-        targets = OffsetShape(obstacle.shape, first.radius), OffsetShape(body.shape, second.radius)
+        sides, centre = ((obstacle.shape, first.radius), (body.shape, second.radius)), np.zeros(body.shape.dim)
+        targets = [TranslatedShape(shape, centre, radius) for shape, radius in sides]
         # a triangle mesh has no distance function: it is in contact with others at its own points alone
         if isinstance(body.shape, TriangleMeshShape):
-            second, targets = InsetPoints(np.empty((0, 3)), 0.0), (targets[0], targets[0])
-        # an OffsetShape has all of a Shape that `evaluate_points` needs
-        return cls((first, second), cast("tuple[Shape, Shape]", targets), max(body.friction, obstacle.friction))
+            second, targets = InsetPoints(np.empty((0, 3)), 0.0), targets[:1] * 2
+        return cls((first, second), (targets[0], targets[1]), max(body.friction, obstacle.friction))
 
     def sides(self, body: Pose, obstacle: Pose) -> Iterator[tuple[Values, PosedShape]]:
         """(n, d) points of each obstacle in space, m, and the shape that they are in contact with."""

@@ -22,7 +22,7 @@ from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
 from .closest_point import SEARCH
 from .laws import BARRIER, Barrier
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
-from .shapes import HalfSpace, OffsetShape, RevolvedBody, RoundedBox, TranslatedShape
+from .shapes import HalfSpace, RevolvedBody, RoundedBox, TranslatedShape
 
 SOURCE = Path(__file__).with_suffix(".c")
 _SEARCH = np.array([
@@ -138,10 +138,9 @@ def _pack_shape(original: Hashable) -> Values:
     """Numbers of a shape at the origin: `Obstacle` of shape_kernels.c."""
     growth, origin, shape = 0.0, np.zeros(3), cast("Any", original)
     min_radius = getattr(shape, "min_radius", np.inf)
-    if isinstance(shape, OffsetShape):
-        growth, shape = shape.offset, shape.shape
-    if isinstance(shape, TranslatedShape):
-        origin[: shape.dim], shape = shape.offset, shape.shape
+    while isinstance(shape, TranslatedShape):
+        origin[: shape.dim] += shape.offset
+        growth, shape = growth + shape.growth, shape.shape
     sign = -1.0 if isinstance(shape, ConvexBody) and shape.hollow else 1.0
     kind, axis, half, radius, fillet = _parameters(shape)
     axes = np.zeros((2, 3))

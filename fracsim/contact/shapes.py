@@ -37,7 +37,7 @@ from .shape_base import (
 )
 
 __all__ = [
-    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RevolvedBody", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
+    "SHAPES", "Capsule", "HalfSpace", "RevolvedBody", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
     "TranslatedShape",
 ]  # fmt: skip
 
@@ -348,14 +348,19 @@ class RoundedBox(ConvexBody):
 
 
 @dataclass(frozen=True, eq=False)
-class _DerivedShape:
-    """Shape made of another one, whose dimension, convexity and compiled functions it has.
+class TranslatedShape:
+    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
 
     Attributes:
-        shape: original shape.
+        shape: original shape, whose compiled functions serve this one, too.
+        offset: (d,) its centre, m.
+        growth: length by which all distances are smaller, m, as of a shape that is grown.
     """
 
+    kind: ClassVar[str] = "shape on a hinge"
     shape: Shape
+    offset: Values
+    growth: float = 0.0
 
     @property
     def kernels(self) -> ShapeKernels | None:
@@ -372,18 +377,10 @@ class _DerivedShape:
         """Whether the original shape is convex."""
         return self.shape.convex
 
-
-@dataclass(frozen=True, eq=False)
-class TranslatedShape(_DerivedShape):
-    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
-
-    Attributes:
-        offset: (d,) its centre, m.
-    """
-
-    kind: ClassVar[str] = "shape on a hinge"
-    rotation_invariant: ClassVar[bool] = False  # a rotation about the reference point moves it
-    offset: Values
+    @property
+    def rotation_invariant(self) -> bool:
+        """Whether no rotation about the reference point changes the shape: with an offset all do."""
+        return self.shape.rotation_invariant and not self.offset.any()
 
     @property
     def min_radius(self) -> float:
@@ -397,7 +394,7 @@ class TranslatedShape(_DerivedShape):
 
     def inset(self, by: float) -> TranslatedShape:
         """The shape with its surface receded by `by`, m."""
-        return TranslatedShape(self.shape.inset(by), self.offset)
+        return replace(self, shape=self.shape.inset(by))
 
     @property
     def volume(self) -> float:
@@ -406,7 +403,7 @@ class TranslatedShape(_DerivedShape):
 
     def distance(self, x: Values) -> Values:
         """(n,) signed distances, m."""
-        return self.shape.distance(x - self.offset)
+        return self.shape.distance(x - self.offset) - self.growth
 
     def normal(self, x: Values) -> Values:
         """(n, d) gradients of the distance."""
@@ -428,34 +425,6 @@ class TranslatedShape(_DerivedShape):
         if self.dim == 2:
             return np.asarray(central + mass * (o @ o))
         return np.asarray(central + mass * ((o @ o) * np.eye(3) - np.outer(o, o)))
-
-
-@dataclass(frozen=True, eq=False)
-class OffsetShape(_DerivedShape):
-    """All points within an offset of a shape: its distance minus the offset.
-
-    Attributes:
-        offset: m.
-    """
-
-    offset: float
-
-    @property
-    def rotation_invariant(self) -> bool:
-        """Whether no rotation about the reference point changes the shape."""
-        return self.shape.rotation_invariant
-
-    def distance(self, x: Values) -> Values:
-        """(n,) signed distances, m."""
-        return self.shape.distance(x) - self.offset
-
-    def normal(self, x: Values) -> Values:
-        """(n, d) gradients of the distance."""
-        return self.shape.normal(x)
-
-    def curvature(self, x: Values) -> Values:
-        """(n, d, d) Hessians of the distance, 1/m."""
-        return self.shape.curvature(x)
 
 
 # the name that a study gives -> class
