@@ -96,7 +96,9 @@ class MeshObstacle:
         lengths = np.linalg.norm(sides, axis=2)
         self.max_error, self.edge = float(lengths.max() / np.sqrt(3)), float(lengths.mean())
         self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
-        self.move_to(Pose.at_point(np.zeros(3)))
+        self.pose = Pose.at_point(np.zeros(3))
+        self._positions: Values | None = points
+        self._bounds: tuple[Values, Values] | None = self._box
 
     @classmethod
     def of(cls, obstacle: RigidObstacle, friction: float) -> MeshObstacle:
@@ -106,9 +108,8 @@ class MeshObstacle:
 
     def move_to(self, pose: Pose) -> None:
         """Move to a pose; points are computed when they are asked for, as most obstacles are far in most steps."""
-        self.pose = pose
-        self._positions: Values | None = None
-        self._bounds: tuple[Values, Values] | None = None
+        if not pose.equals(self.pose):
+            self.pose, self._positions, self._bounds = pose, None, None
 
     @property
     def positions(self) -> Values:

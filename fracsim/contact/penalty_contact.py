@@ -207,7 +207,6 @@ class PenaltyMeshContact(PenaltyContact):
     """
 
     name = "solids"
-    _end_u: Values | None = None
 
     def __init__(
         self,
@@ -233,10 +232,8 @@ class PenaltyMeshContact(PenaltyContact):
     # --- motion ---
 
     def _move_to(self, posed: Sequence[PosedShape]) -> None:
-        """Move the meshes to the poses of all obstacles; discard forces where they have moved."""
-        last, self._posed = self._posed, [posed[number] for number in self.group.numbers]
-        if all(new is old or new.pose.equals(old.pose) for new, old in zip(self._posed, last, strict=True)):
-            return
+        """Move the meshes to the poses of all obstacles."""
+        self._posed = [posed[number] for number in self.group.numbers]
         for mesh, shape in zip(self._all_meshes, self._posed, strict=True):
             mesh.move_to(shape.pose)
         self.update_displacement()
@@ -251,18 +248,7 @@ class PenaltyMeshContact(PenaltyContact):
 
     def _is_far(self) -> bool:
         """Whether the body is far from the obstacles at the current u and poses (collective)."""
-        return self._clearance.is_far([self._end_displacement()], [(posed, posed) for posed in self._posed])
-
-    def _end_displacement(self) -> Values:
-        """(owned dofs,) displacement, m: one array as long as it is the same."""
-        if self._end_u is None:
-            self._end_u = self._u.x.array[: self._owned]
-        return self._end_u
-
-    def update_displacement(self) -> None:
-        """Discard positions and forces, as u or poses have changed."""
-        self._end_u = None
-        super().update_displacement()
+        return self._clearance.is_far([self._u.x.array[: self._owned]], [(posed, posed) for posed in self._posed])
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
@@ -330,7 +316,7 @@ class PenaltyMeshContact(PenaltyContact):
     def _gap(self, index: int) -> float:
         """Least distance between an obstacle and the body, m, of this rank's points (collective)."""
         if self.state.is_idle():
-            return self._clearance.least_gap(index, self._end_displacement(), self._posed)
+            return self._clearance.least_gap(index, self._u.x.array[: self._owned], self._posed)
         return self._parts[index].gap(self._end_positions())
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:

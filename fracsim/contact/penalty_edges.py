@@ -134,7 +134,9 @@ class EdgeContacts:
         """Candidates (k, 2) with gaps below `reach`, m, that cross in projection, with points at x (n, 3), m."""
         pairs = pairs[self._is_owned[pairs[:, 0]]]
         crossing = _CrossingEdges.of(x[self._sharp.ends[pairs].reshape(-1, 4)])
-        pairs = pairs[crossing.cross_in_projection() & (crossing.distance < self._max_gap)]
+        # the closest points lie between the ends of both; never those of parallel edges
+        crosses = ((crossing.position > 0) & (crossing.position < 1)).all(axis=1)
+        pairs = pairs[crosses & (abs(crossing.height) < self._max_gap)]
         ends: Ints = self._sharp.ends[pairs].reshape(-1, 4)
         crossing = _CrossingEdges.of(x[ends])
         stored = self._row(self._pair_key(pairs))
@@ -187,15 +189,6 @@ class _CrossingEdges:
         normal = np.cross(a, b) / np.sqrt(determinant)[:, None]
         offset = r + s[:, None] * a - t[:, None] * b
         return cls(a, b, offset, np.stack([s, t], axis=1), normal, np.stack([A, B, C], axis=1))
-
-    def cross_in_projection(self) -> Flags:
-        """(k,) whether the closest points lie between the ends of both; never of parallel edges."""
-        return np.asarray(((self.position > 0) & (self.position < 1)).all(axis=1))
-
-    @property
-    def distance(self) -> Values:
-        """(k,) distance of the lines, m."""
-        return np.linalg.norm(self.offset, axis=1)
 
     @property
     def height(self) -> Values:

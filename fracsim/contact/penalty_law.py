@@ -30,8 +30,31 @@ from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
 from .laws import slipped, tangential
 
-# weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
-MIN_WEIGHT = 1e-6
+
+@dataclass(frozen=True)
+class PenaltyPolicy:
+    """Tuned numbers of penalties; shares are those of what contact may add to the square of a frequency.
+
+    Attributes:
+        near_gap: gap, in widths of the penalty, of what may act a step later, before analytic obstacles and between
+            obstacles.
+        point_share: of points of surfaces: a node may be in contact with as many points as it carries, and so may they.
+        facet_share: of facets before analytic obstacles, beside points.
+        pair_share: of a pair of obstacles.
+        pair_width: width of the penalty between two obstacles from files in their gap at the start, where that is
+            smaller than the width.
+        min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
+    """
+
+    near_gap: float = 3.0
+    point_share: float = 0.25
+    facet_share: float = 0.5
+    pair_share: float = 0.2
+    pair_width: float = 0.5
+    min_weight: float = 1e-6
+
+
+PENALTY = PenaltyPolicy()
 
 
 @dataclass(frozen=True)
@@ -339,7 +362,7 @@ class NodalMassShare:
         k_p = A_p cause at the nodes of the point. `local_area`: (n,) share of this rank in `area`; None: all of it.
         """
         rate, entries = self.node_rates(area if local_area is None else local_area), self._size.tocoo()
-        counts = entries.data > MIN_WEIGHT * np.asarray(self._size.sum(axis=1)).ravel()[entries.row]
+        counts = entries.data > PENALTY.min_weight * np.asarray(self._size.sum(axis=1)).ravel()[entries.row]
         max_rate = np.zeros(len(area))
         np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
         return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)

@@ -23,7 +23,7 @@ from .inset_points import SAMPLES
 from .laws import Penalty
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
 from .obstacle_pairs import Numbers, ObstaclePair
-from .penalty_law import ContactStiffness, PenaltyContacts, PenaltyForces, Slips
+from .penalty_law import PENALTY, ContactStiffness, PenaltyContacts, PenaltyForces, Slips
 from .pose import Pose, PosedShape, resultant
 from .rigid_obstacles import RigidObstacles
 from .triangle_mesh_shape import TriangleMeshShape
@@ -34,24 +34,6 @@ if TYPE_CHECKING:
 
 
 type Poses = tuple[Pose, Pose]
-
-
-@dataclass(frozen=True)
-class PairPenaltyPolicy:
-    """Tuned numbers of the penalty between two obstacles.
-
-    Attributes:
-        share: of what contact may add to the square of a frequency.
-        near_gap: gap, in widths of the penalty, up to which contacts are followed, since they may act a step later.
-        gap_share: width of the penalty in the gap at the start, where that is smaller than the width.
-    """
-
-    share: float = 0.2
-    near_gap: float = 3.0
-    gap_share: float = 0.5
-
-
-PAIR_PENALTY = PairPenaltyPolicy()
 
 
 @dataclass(frozen=True)
@@ -137,7 +119,7 @@ class InsetPointContacts:
 
     def near_contacts(self, poses: Poses) -> NearContacts | None:
         """Contacts that may act a step later; None: they are too far apart."""
-        reach = PAIR_PENALTY.near_gap * self.width
+        reach = PENALTY.near_gap * self.width
         if self._pair.gap_bound(*poses) >= reach:
             return None
         parts, count = [], 0
@@ -180,7 +162,7 @@ class MeshContacts:
         self._part = self._build_part(penalty.rate, penalty.width)
         start = self._part.points(self._first.positions_at(first.posed_at(0.0).pose), second.posed_at(0.0).pose)
         if (gap := self._part.pairs.min_gap(start)) < penalty.width:
-            self._part = self._build_part(penalty.rate, PAIR_PENALTY.gap_share * gap)
+            self._part = self._build_part(penalty.rate, PENALTY.pair_width * gap)
         self.width, self.set_history = self._part.pairs.width, self._part.pairs.set_history
 
     def _build_part(self, rate: float, width: float) -> SurfacePart[PenaltyPairs]:
@@ -195,7 +177,7 @@ class MeshContacts:
         stiffness = ContactStiffness.of_one_body(0.5 * rate * vertex_areas(points, triangles))
         patch = (np.arange(len(points)) >= n).astype(np.int32)
         pairs = PenaltyPairs(points, triangles, stiffness, distance=width, patch=patch)
-        return SurfacePart(pairs, first.triangles, PAIR_PENALTY.near_gap * width, second.friction, second)
+        return SurfacePart(pairs, first.triangles, PENALTY.near_gap * width, second.friction, second)
 
     def near_contacts(self, poses: Poses) -> NearContacts | None:
         """Contacts that may act a step later; None: they are too far apart."""
@@ -252,7 +234,7 @@ class PenaltyPair:
         areas = [inset.areas for inset in pair.points if len(inset.points)]
         touching = min((max(SAMPLES.touching_share * area.sum(), area.max()) for area in areas), default=0.0)
         mass = min(obstacle.mass for obstacle in (first, second) if isinstance(obstacle, FreeObstacle))
-        limit = PAIR_PENALTY.share * max_added * mass * penalty.width / max(touching, np.finfo(float).tiny)
+        limit = PENALTY.pair_share * max_added * mass * penalty.width / max(touching, np.finfo(float).tiny)
         penalty = replace(penalty, stiffness=min(penalty.stiffness, limit))
         self.contacts: Any = (
             MeshContacts(first, second, penalty) if all(are_meshes) else InsetPointContacts(pair, penalty)

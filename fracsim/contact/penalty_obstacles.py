@@ -34,25 +34,9 @@ from .laws import ObstacleLaw, Penalty
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips, penalty_stiffness
+from .penalty_law import PENALTY, NodalMassShare, PenaltyContacts, PenaltyForces, Slips, penalty_stiffness
 from .pose import PosedShape
 from .rigid_obstacles import RigidObstacles
-
-
-@dataclass(frozen=True)
-class PenaltyPolicy:
-    """Tuned numbers of penalty contact.
-
-    Attributes:
-        near_gap: gap, in widths of the penalty, of points that may be in contact a step later.
-        facet_share: part of what contact may add to the square of a frequency that facets may cause beside points.
-    """
-
-    near_gap: float = 3.0
-    facet_share: float = 0.5
-
-
-PENALTY = PenaltyPolicy()
 
 
 @dataclass(frozen=True)

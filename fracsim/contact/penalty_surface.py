@@ -27,6 +27,7 @@ from .element_exchange import EXCHANGE, bounding_boxes, motion_diagonals, own_po
 from .mesh_obstacles import MeshObstacle, SurfacePart
 from .partitioned_surface import PartitionedSurface
 from .penalty_law import (
+    PENALTY,
     ContactStiffness,
     ElementRanks,
     NodalMassShare,
@@ -37,9 +38,6 @@ from .penalty_pairs import PAIRS, PenaltyPairs
 from .retractable_surface import RetractableSurface, SelfContactLaw
 from .sample_points import vertex_areas
 
-# share of the allowed increase of the square of a frequency that points may cause: a node may be in contact with as
-# many points as it carries, and so may those points
-MAX_ADDED = 0.25
 type PenaltyPart = SurfacePart[PenaltyPairs]  # contact of the body with itself, or with an obstacle
 
 
@@ -119,7 +117,7 @@ class PenaltyBodySurface(PartitionedSurface[SurfacePart[PenaltyPairs]]):
             return nodes(total)[:, 0].copy()
 
         # before obstacles twice that of self-contact, where both sides yield
-        limit = (2 if self._meshes else 1) * MAX_ADDED * self._max_added
+        limit = (2 if self._meshes else 1) * PENALTY.point_share * self._max_added
         mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), nodal_sums)
         return penalty_stiffness(mass_share, area, 0.5 * self.law.stiffness / self.law.distance, limit, local_area)
 
