@@ -293,15 +293,15 @@ class PenaltyObstacleTerm(ObstacleTerm):
             return {}
         all_keys, all_rows = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
         _, first = np.unique(np.column_stack([all_rows[:, 0], all_keys]), axis=0, return_index=True)
-        return {"spring_points": all_keys[first], "springs": all_rows[first], "pushed": sums}
+        return {"spring_keys": all_keys[first], "slips": all_rows[first], "pushed": sums}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective).
 
         Raises ValueError if it has keys of no element.
         """
-        find_saved_keys(self.comm, self._spring_keys(), saved["spring_points"])
-        rows, keys, is_root = saved["springs"], saved["spring_points"].astype(np.int64), self.comm.rank == 0
+        find_saved_keys(self.comm, self._spring_keys(), saved["spring_keys"])
+        rows, keys, is_root = saved["slips"], saved["spring_keys"].astype(np.int64), self.comm.rank == 0
         *forces, energy = saved["pushed"] * is_root
         selected = [rows[:, 0] == number for number in range(len(self.group.obstacles))]
         slips = [Slips(keys[which], rows[which, 1:]) for which in selected]

@@ -276,12 +276,12 @@ class PenaltyState:
         for index, history in enumerate(self._histories):
             if (of_ranks := gather(self._comm, history)) is not None:
                 of_all = PenaltyContacts.join(of_ranks)
-                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.to_array()}
+                arrays |= {f"points_{index}": cast("Values", of_all.points), f"contacts_{index}": of_all.to_array()}
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
-        names = [(f"points_{index}", f"values_{index}") for index in range(len(self._histories))]
+        names = [(f"points_{index}", f"contacts_{index}") for index in range(len(self._histories))]
         histories = [PenaltyContacts.from_array(cast("Ints", saved[key]), saved[rows]) for key, rows in names]
         is_near = any(len(history.points) for history in histories)
         self.restore((histories, self._surface.surface_count, IdleState(is_near)))
