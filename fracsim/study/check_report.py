@@ -318,9 +318,9 @@ def _plasticity(study: Study) -> str:
 
 
 def _staggered_note(study: Study) -> Iterator[str]:
-    """Yield a note on flow that follows the steps of a body without inertia."""
+    """Yield a note on flow that follows the steps."""
     table = study.plasticity
-    if table is not None and table.update == "staggered" and study.time.scheme == "quasi-static":
+    if table is not None and table.update == "staggered":
         yield "note: in a step of strain d the stress is up to 3 G d above that of yield, G being the shear modulus;"
         yield 'update = "implicit" has no such error'
 
