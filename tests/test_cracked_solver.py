@@ -17,13 +17,11 @@ from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.solvers.policy import DEFAULT_POLICY
-from fracsim.solvers.preconditioner import mass_stiffness_ratio
 from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
-from support.torn import hanging_parts
 
-pytestmark = pytest.mark.fast_solver_only("multigrid of another kind for a body in pieces, deflation, blocks")
+pytestmark = pytest.mark.fast_solver_only("multigrid of another kind for a body in pieces, blocks")
 
 SOLVER: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
@@ -95,51 +93,6 @@ def smoothers(scene: Scene) -> list[tuple[str, int]]:
     pc = scene.solver.linear.preconditioner.pc  # type: ignore[union-attr]
     levels = [pc.getMGSmoother(level) for level in range(1, pc.getMGLevels())]
     return [(level.pc.getType(), level.max_it) for level in levels]
-
-
-def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ten planes through a bar and steps in which inertia holds nothing: at most six tenths of the iterations
-    that it takes by multigrid of another kind (0.44 with PETSc 3.22). Its tangent is positive: moduli made positive
-    would hold the fragments as well."""
-    its = []
-    for held in (DEFAULT_POLICY.max_deflated_inertia, 0.0):
-        set_policy(monkeypatch, max_deflated_inertia=held)
-        its.append(sum(shattered(0.04, 10, {}, 6, step=0.1, energy="linear")[1][-3:]))
-    assert its[0] < 0.6 * its[1], f"{its[0]} iterations, {its[1]} without"
-
-
-def test_halves_are_left_to_multigrid(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One plane through a bar in long steps: CG takes no more iterations once the rigid motions of the smaller half are
-    not solved for by themselves, as they are in steps that are longer still."""
-    scene, its = shattered(0.025, 1, {}, 4, step=0.03)
-    ratio = mass_stiffness_ratio(scene.balance)
-    assert DEFAULT_POLICY.max_large_deflated_inertia < ratio < DEFAULT_POLICY.max_deflated_inertia
-    set_policy(monkeypatch, max_large_deflated_inertia=np.inf)
-    other, deflated = shattered(0.025, 1, {}, 4, step=0.03)
-    solvers = [each.solver for each in (scene, other)]
-    assert [solver.linear.preconditioner.applied._deflation is None for solver in solvers] == [True, False]  # type: ignore[union-attr]
-    assert sum(its[1:]) <= sum(deflated[1:])
-
-
-def test_deflation_of_an_earlier_tangent_remains_positive() -> None:
-    """Fragments are deflated by the tangent with which a step begins: applied to later ones, P is as it was."""
-    scene, deflation, _, _ = hanging_parts()
-    assert deflation.pc is not None
-    balance, rng = scene.balance, np.random.default_rng(4)
-    nodes = scene.domain.node_count
-    balance.u.x.array[:] += 0.02 * rng.standard_normal(len(balance.u.x.array))
-    balance.tangent.assemble()
-    deflation.base_pc.setOperators(balance.tangent.matrix)
-    x, y = balance.work_vector.duplicate(), balance.work_vector.duplicate()
-    given = rng.standard_normal((30, 3 * nodes))
-    found = np.empty_like(given)
-    for row, result in zip(given, found, strict=True):
-        x.array_w[:] = row
-        deflation.pc.apply(x, y)
-        result[:] = y.array_r
-    products = given @ found.T
-    np.testing.assert_allclose(products, products.T, atol=1e-9 * np.abs(products).max())
-    assert np.linalg.eigvalsh(products).min() > 0
 
 
 def test_sweeps_do_for_what_is_in_pieces_in_short_steps() -> None:

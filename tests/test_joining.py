@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
-from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -15,9 +14,7 @@ from fracsim.fracture.node_retention import NodeAttachment
 from fracsim.mechanics.node_ties import NodeTies
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
-from fracsim.mesh.node_cells import node_components
 from fracsim.scene import Scene
-from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.preconditioner import Update
 from support.scenes import Walk, each_step, make_scene, march
 from support.solver_policy import set_policy
@@ -359,41 +356,3 @@ def test_multigrid_knows_of_rotations_once_nodes_are_tied(dim: int, monkeypatch:
     assert scene.solver is not None
     found = scene.balance.tangent.matrix.getNearNullSpace()
     assert found and len(found.getVecs()) == {2: 3, 3: 6}[dim]
-
-
-@pytest.mark.parametrize("dim", (2, 3))
-def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
-    """A cell without neighbours, in steps so long that inertia holds nothing, turns with the node that is tied to it:
-    what sees to loose parts knows that motion from its forces."""
-    scene, walk, tethers = tied(dim, time={"scheme": "backward-euler", "step": 1e3, "end": 1e4})
-    domain, balance = scene.domain, scene.balance
-    assert balance.stress.chi is not None
-    cell = int(np.flatnonzero(domain.input_numbering.cells == tethers.ties.cell[0])[0])
-    shared = np.isin(domain.cell_nodes, domain.cell_nodes[cell]).sum(axis=1)
-    balance.stress.chi.x.array[: domain.cell_count][shared == dim] = 0.0
-    balance.damage_changed()
-    balance.begin_step(1e3, 1e3, walk.state.u, walk.state.v, walk.state.a)
-    balance.tangent.assemble()
-    jacobi = PETSc.PC().create(domain.comm)
-    jacobi.setType("jacobi")
-    jacobi.setOperators(balance.tangent.matrix)
-    _, part = node_components(domain, balance.stress.chi.x.array[: domain.cell_count] > 0)
-    own = int(part[domain.cell_nodes[cell]].max())
-    node = np.flatnonzero(domain.input_numbering.nodes == tethers.ties.nodes[0, 0])
-    assert own > 0 and part[node] == -1
-    loose = create_deflation(balance, jacobi)
-    assert loose is not None
-    loose.update()
-    assert loose.pc is not None
-    x = domain.nodes + walk.state.u.reshape(-1, dim)
-    spin = np.array([[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]])[:dim, :dim]
-    goes = (part == own) | np.isin(
-        domain.input_numbering.nodes, tethers.ties.nodes[tethers.ties.cell == tethers.ties.cell[0], 0]
-    )
-    moved = np.where(goes[:, None], x @ spin.T + 0.5, 0.0)
-    assert goes[node] and (part == own).any()
-    a, b = balance.work_vector.duplicate(), balance.work_vector.duplicate()
-    a.array_w[:] = moved.reshape(-1)
-    balance.tangent.matrix.mult(a, b)
-    loose.pc.apply(b, a)
-    np.testing.assert_allclose(a.array_r.reshape(-1, dim), moved, atol=1e-6 * np.abs(moved).max())

@@ -241,31 +241,20 @@ def test_dead_cells_are_left_out(results: Results, ranks: int) -> None:
 
 
 @pytest.mark.parametrize("ranks", RANKS)
-def test_parts_that_hang_by_nodes_and_edges(results: Results, ranks: int) -> None:
+def test_parts_that_share_nodes_or_edges_alone(results: Results, ranks: int) -> None:
     """Parts are those of the graph of cells that share facets; each node goes with the largest around it."""
     found, cells = results(ranks), mesh_named("3d").cells
     cells = cells[some_whole(np.arange(len(cells)))]
     shared = (cells[:, None, :, None] == cells[None, :, None, :]).sum(axis=(2, 3)) == 3
     count, part = connected_components(coo_matrix(shared), directed=False)
     size = np.bincount(part)
-    assert found["hanging-count"] == count > 5
-    of_node = found["hanging-part"].astype(int)
+    assert found["parts-count"] == count > 5
+    of_node = found["parts-of-node"].astype(int)
     sizes = [size[part[(cells == node).any(axis=1)]] for node in range(len(of_node))]
     numbers = np.sort(size)[::-1]
     assert all(numbers[mine] == around.max() if len(around) else mine == -1
                for mine, around in zip(of_node, sizes, strict=True))  # fmt: skip
-    assert np.array_equal(of_node, results(1)["hanging-part"])
-
-
-@pytest.mark.parametrize("ranks", RANKS)
-def test_what_hangs_is_solved_for_by_itself(results: Results, ranks: int) -> None:
-    """P K z = z of a part that turns; P is the same on any number of ranks (inertia is 1e-8 of the stiffness)."""
-    found = results(ranks)
-    turned = found["hanging-turned"]
-    assert scale(turned) > 1
-    np.testing.assert_allclose(found["hanging-found"], turned, atol=1e-6 * scale(turned))
-    serial = results(1)["hanging-any"]
-    np.testing.assert_allclose(found["hanging-any"], serial, atol=1e-5 * scale(serial))
+    assert np.array_equal(of_node, results(1)["parts-of-node"])
 
 
 def test_the_runs_do_tear() -> None:

@@ -11,7 +11,6 @@ direct_solver          factors of the tangent (MUMPS), and their cost
 preconditioner         multigrid or SSOR: when it is rebuilt, and from what
 plain_solver           linear solver of `plain = true`: PETSc alone
 balancing              balancing preconditioner: exact solutions in a coarse space, as for nodes in contact
-deflation              coarse space of fragments that are hardly attached
 tangent_operators      tangent as the matrices that a KSP takes: in blocks of a node's dofs, with low-rank updates
 multigrid              V cycle in single precision
 policy                 tuned numbers

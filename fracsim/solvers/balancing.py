@@ -4,11 +4,9 @@
 
 M is the preconditioner of the body, and the columns of Z span the coarse space. P is the abstract balancing
 preconditioner, P_BNN of Tang et al. (2009), from Mandel (1993). It is symmetric, and positive definite where M and E
-are. A Z has few rows, so that P costs about as much as M. There are two coarse spaces:
-
-- rigid motions of fragments (solvers.deflation),
-- dofs of some nodes (`solve_nodes_exactly`): of those that a stiffness C beside the tangent K couples, as contact has
-  it, and of those around which K has changed since M was set up. A = K + C.
+are. A Z has few rows, so that P costs about as much as M. The coarse space has the dofs of some nodes: of those that a
+stiffness C beside the tangent K couples, as contact has it, and of those around which K has changed since M was set up.
+A = K + C.
 
 Equations: docs/theory.md#linear-systems.
 """

@@ -147,7 +147,6 @@ class LinearSolver:
         self.failures = 0
         # Iterations of the last solve to the tight tolerance; None: those of the KSP.
         self._equivalent: int | None = None
-        self._begins = True  # a nonlinear or linear step, with the next solve
         self.correction = balance.work_vector.duplicate()
         self.operators = TangentOperators(
             balance, policy, for_multigrid=chosen["pc_type"] in ("gamg", "ml", "hypre"),
@@ -236,7 +235,6 @@ class LinearSolver:
 
     def begin_attempt(self) -> None:
         """Begin an attempt of Newton's method."""
-        self._begins = True
         if self.forcing is not None:
             self.forcing.begin_attempt()
 
@@ -257,8 +255,7 @@ class LinearSolver:
         if self.direct.serves:
             self.direct.update(self.ksp, self.operators)
             return
-        self.preconditioner.update(self.operators, begins=self._begins)
-        self._begins = False
+        self.preconditioner.update(self.operators)
         self._attach_preconditioner()
 
     def _attach_preconditioner(self) -> None:
@@ -358,7 +355,6 @@ class LinearSolver:
         Returns:
             |r| that is left, inf if it is unknown, and iterations; None if it was not solved.
         """
-        self._begins = True
         if self._step_cg is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve(eigenvalue_floor) else None
         if not self.balance.scheme.inertia:

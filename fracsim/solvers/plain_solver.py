@@ -58,8 +58,8 @@ class PlainPreconditioner:
         self._ksp = ksp
         self.pc = self.serving = ksp.getPC()
 
-    def update(self, operators: TangentOperators, *, begins: bool) -> None:
-        """Set up for the tangent of the next solve, whether a step `begins` or not (collective)."""
+    def update(self, operators: TangentOperators) -> None:
+        """Set up for the tangent of the next solve (collective)."""
         operators.update_entries()
         renew_smoothers(self.pc)
         operators.attach_to(self._ksp, self.pc)

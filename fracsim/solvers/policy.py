@@ -113,9 +113,6 @@ class SolverPolicy:
     gmres_restart: int = 200
 
     # --- preconditioner ---
-    # c_a rho h^2 / Y. Above it inertia resists the motion of parts that are attached by a node or an edge, and no
-    # deflation is needed.
-    max_deflated_inertia: float = 1e-3
     # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
     # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
     min_ssor_inertia: float = 1e-2
@@ -161,16 +158,6 @@ class SolverPolicy:
     # Charpy bar takes 1.3 times as long without the share, a jelly of 33,000 nodes with 2,000 in place of 6,000.
     max_changed_share: float = 0.2
     max_changed_nodes: int = 6000
-
-    # --- deflation ---
-    # Nodes of a fragment up to which its rigid motions are deflated. Measured on a cylinder of 6,100 nodes that one
-    # plane cuts: 10 iterations in place of 19, and no set-up in each step; with ten planes 16 and 15.
-    max_deflated_nodes: int = 50
-    # c_a rho h^2 / Y. Below it larger fragments are deflated as well, which round-off of multigrid would hold. Measured
-    # on that cylinder with ten planes: at 7e-10 10 iterations, at 7e-13 156 in place of 35.
-    max_large_deflated_inertia: float = 1e-10
-    # Share of the largest eigenvalue of a fragment's Gram matrix, below which rigid motions are linearly dependent.
-    dependent_motion_tolerance: float = 1e-8
 
     # --- nonlinear elimination ---
     # Share of |r|^2 on the nodes that are relaxed: no more of them than it takes, and the least that is worth it.

@@ -9,7 +9,6 @@ Equations: docs/theory.md#linear-systems.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -26,7 +25,6 @@ from .petsc_options import PetscOptions, PetscOptionSet, stored_products
 from .policy import SolverPolicy
 
 if TYPE_CHECKING:
-    from .deflation import FragmentDeflation
     from .multigrid.levels import FineLevel
     from .multigrid.vcycle import SinglePrecisionVCycle
     from .tangent_operators import TangentOperators
@@ -98,7 +96,6 @@ class AppliedPreconditioner:
 
     Attributes:
         pc: PETSc's preconditioner of the whole body.
-        serving: preconditioner that is applied: `pc`, the V cycle copied from it, or deflation around one of these.
         vcycle: V cycle in single precision, copied from `pc`; None: PETSc's own is applied.
         keeps_coarse_spaces: whether `pc` is still set up, so that a refresh is possible.
         changed_nodes: (n,) owned nodes around those whose stiffness has changed since the set-up, to be solved for
@@ -113,10 +110,9 @@ class AppliedPreconditioner:
         """`is_default`: whether the study chooses no preconditioner."""
         self._ksp, self._options, self._balance, self._policy = ksp, options, balance, policy
         self._is_default = is_default
-        self.pc = self.serving = ksp.getPC()
+        self.pc = ksp.getPC()
         self.vcycle: SinglePrecisionVCycle | None = None
         self.keeps_coarse_spaces = True
-        self._deflation: FragmentDeflation | None = None
 
     def change_kind(self, options: PetscOptions) -> None:
         """Change options of `pc`, which has to be rebuilt after this."""
@@ -148,39 +144,9 @@ class AppliedPreconditioner:
         self.keeps_coarse_spaces = self.vcycle is None or not is_large
 
     @property
-    def may_deflate(self) -> bool:
-        """Whether fragments may be deflated: without inertia they hang by a residual stiffness."""
-        return self._is_default and self._balance.scheme.inertia and self.pc.getType() == "gamg"
-
-    def serve(self, operators: TangentOperators, *, new_fragments: bool, moved: bool) -> None:
-        """Choose `serving` for the tangent of the next solve (collective).
-
-        Args:
-            operators: tangent.
-            new_fragments: whether rigid motions of the present fragments are deflated, unless inertia holds them.
-            moved: whether these motions and their forces are evaluated anew.
-        """
-        base = self.serving = self.pc if self.vcycle is None else self.vcycle.pc
-        if self.vcycle is not None:
-            self.vcycle.update_operator()
-        if new_fragments:
-            self.release_deflation()
-            if (inertia := mass_stiffness_ratio(self._balance)) <= self._policy.max_deflated_inertia:
-                from .deflation import create_deflation
-
-                is_held = inertia > self._policy.max_large_deflated_inertia
-                max_nodes = self._policy.max_deflated_nodes if is_held else math.inf
-                self._deflation = create_deflation(self._balance, base, self._policy, max_nodes)
-        deflation = self._deflation
-        if deflation is None or deflation.base_pc is not base:
-            return
-        if new_fragments or moved:
-            deflation.update()
-        if deflation.pc is not None:
-            # The balancing preconditioner applies this one as it is.
-            self.pc.setReusePreconditioner(True)
-            renew_smoothers(self.pc)
-            self.serving = deflation.pc
+    def serving(self) -> PETSc.PC:
+        """Preconditioner that is applied: `pc`, or the V cycle copied from it."""
+        return self.pc if self.vcycle is None else self.vcycle.pc
 
     def find_changed_nodes(self) -> None:
         """Find `changed_nodes` for the tangent of the next solve (collective)."""
@@ -200,12 +166,6 @@ class AppliedPreconditioner:
         if self.vcycle is not None:
             self.vcycle.destroy()
             self.vcycle = None
-
-    def release_deflation(self) -> None:
-        """Free the deflation of fragments."""
-        if self._deflation is not None:
-            self._deflation.destroy()
-            self._deflation = None
 
 
 class Preconditioner:
@@ -247,7 +207,6 @@ class Preconditioner:
         self._edges_since_rebuild = False
         self._ever_broken = False
         self._pattern_is_new = False
-        self._looks_for_fragments = False  # before the next solve
         # --- decisions ---
         self._due, self._keeps = Update.REBUILD, keeps
         self._last_update = Update.NONE  # before the last solve
@@ -266,7 +225,7 @@ class Preconditioner:
 
     def edges_broke(self, count: int | None) -> None:
         """Record the number of edges that broke on all ranks; None: an unknown number, as after a restart."""
-        self._ever_broken = self._looks_for_fragments = True
+        self._ever_broken = True
         self._edges_since_update += self._node_count if count is None else count
         self._edges_since_rebuild = self._edges_since_rebuild or count != 0
 
@@ -410,20 +369,16 @@ class Preconditioner:
 
     # --- setting up ---
 
-    def update(self, operators: TangentOperators, *, begins: bool) -> None:
-        """Update the preconditioner to the tangent of the next solve (collective).
-
-        `begins`: whether a step begins, so that fragments have moved since the last one.
-        """
+    def update(self, operators: TangentOperators) -> None:
+        """Update the preconditioner to the tangent of the next solve (collective)."""
         # SNES only knows a fixed number of tangents between two set-ups
         self._last_update = self._decide(counts_solve=True)
         if self._last_update != Update.NONE:
             operators.update_entries()  # which may change the pattern
             self._last_update = self._decide(counts_solve=False)
             self._set_up(operators, self._last_update)
-        new_fragments = self._looks_for_fragments and self.applied.may_deflate
-        self._looks_for_fragments = self._looks_for_fragments and not new_fragments
-        self.applied.serve(operators, new_fragments=new_fragments, moved=begins)
+        if self.applied.vcycle is not None:
+            self.applied.vcycle.update_operator()
         if self._ever_broken:
             self.applied.find_changed_nodes()
 
@@ -437,7 +392,6 @@ class Preconditioner:
             self._extra_iterations = 0.0
         self._extra_at_refresh = self._extra_iterations
         self._due, self._edges_since_update, self._pattern_is_new = Update.NONE, 0, False
-        self._looks_for_fragments = self._ever_broken
 
     # --- the solver's side ---
 
@@ -463,5 +417,4 @@ class Preconditioner:
 
     def destroy(self) -> None:
         """Free what was made of `pc`."""
-        self.applied.release_deflation()
         self.applied.release_vcycle()

@@ -178,7 +178,7 @@ class Solvers:
         """(owned dofs,) start after exact tangents have failed, m; also tells the preconditioner of the failure.
 
         The preconditioner is not the cause where the tangent is indefinite: as CG notices, as a line search without
-        descent shows, or by the coarse matrix of the deflation, which makes the preconditioner indefinite.
+        descent shows, or by the exact solution for changed nodes, which makes the preconditioner indefinite.
         """
         reason = PETSc.KSP.ConvergedReason
         if self.ksp.reason > 0 or self.ksp.reason in (reason.DIVERGED_INDEFINITE_MAT, reason.DIVERGED_INDEFINITE_PC):

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx.fem import IntegralType
 from mpi4py import MPI
-from petsc4py import PETSc
 
 from fracsim.fracture.node_retention import CellRetention
 from fracsim.fracture.nonlocal_average import NonlocalAverage
@@ -22,7 +21,6 @@ from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.node_cells import node_components
 from fracsim.mesh.parallel import RemoteRows, sum_over_ranks
 from fracsim.scene import Scene, build_scene
-from fracsim.solvers.deflation import FragmentDeflation, create_deflation
 from fracsim.timestepping.state import State
 from support.solver_policy import other_policy
 
@@ -229,48 +227,11 @@ def some_whole(cells: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     return np.cos(cells) > -0.5
 
 
-def hanging_parts() -> tuple[Scene, FragmentDeflation, npt.NDArray[np.int64], int]:
-    """A body of which a third of the cells has come apart, in steps so long that inertia holds nothing, Jacobi's
-    preconditioner with its deflation, the part of each node, and the number of parts."""
-    fixed = [{"on": "left", "fix": "xyz"}]
-    scene, state = make_scene(
-        mesh=MESHES["3d"], material=SOFT | {"energy": "neo-hookean"}, fracture={"strength": 1e9}, boundary=fixed,
-        time={"scheme": "backward-euler", "step": 1e3, "end": 1e4}, solver=TIGHT,
-    )  # fmt: skip
-    domain, balance = scene.domain, scene.balance
-    whole, chi = some_whole(domain.input_numbering.cells), balance.stress.chi
-    assert chi is not None
-    chi.x.array[: domain.cell_count] = whole
-    balance.begin_step(1e3, 1e3, state.u, state.v, state.a)
-    balance.tangent.assemble()
-    jacobi = PETSc.PC().create(domain.comm)
-    jacobi.setType("jacobi")
-    jacobi.setOperators(balance.tangent.matrix)
-    count, part = node_components(domain, whole)
-    loose = create_deflation(balance, jacobi)
-    assert loose is not None
-    loose.update()
-    return scene, loose, part, count
-
-
-def hanging() -> Found:
-    """What the deflated preconditioner of `hanging_parts` makes of anything, and of the forces of a part that turns."""
-    scene, loose, part, count = hanging_parts()
-    assert loose.pc is not None
-    domain, balance = scene.domain, scene.balance
-    x = domain.nodes[: domain.node_count]
-    turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
-    turned[~balance.motion.free_dofs.reshape(-1, 3)] = 0.0
-    a, b = balance.work_vector.duplicate(), balance.work_vector.duplicate()
-    a.array_w[:] = turned.reshape(-1)
-    balance.tangent.matrix.mult(a, b)
-    loose.pc.apply(b, a)
-    b.array_w[:] = np.cos(1e3 * x).reshape(-1)
-    found = {"hanging-turned": turned, "hanging-found": a.array_r.reshape(-1, 3).copy(), "hanging-part": part}
-    loose.pc.apply(b, a)
-    found |= {"hanging-any": a.array_r.reshape(-1, 3).copy()}
-    gather_nodes = domain.input_numbering.gather_nodes
-    return {name: gather_nodes(each) for name, each in found.items()} | {"hanging-count": np.array(count)}
+def parts() -> Found:
+    """Components of the cells of a body of which a third is split: number of the largest one at each node."""
+    domain = make_scene(mesh=MESHES["3d"], material=SOFT)[0].domain
+    count, part = node_components(domain, some_whole(domain.input_numbering.cells))
+    return {"parts-of-node": domain.input_numbering.gather_nodes(part), "parts-count": np.array(count)}
 
 
 def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) -> Found:
@@ -476,4 +437,4 @@ def compared(folder: Path) -> Found:
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
     found |= dead_cells("lumped", "fitted", "blocks", "brought") | dead_cells("consistent", "blocks", "brought")
-    return found | hanging() | squeezed() | in_blocks()
+    return found | parts() | squeezed() | in_blocks()
