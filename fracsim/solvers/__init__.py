@@ -3,7 +3,7 @@
 nonlinear_solver       solve of a step by a sequence of strategies
 strategies             strategies, the order in which they are tried, and which one begins
 newton                 one attempt of Newton's method (PETSc's SNES)
-line_search            merit function of the line search, positive tangents, clipped corrections
+line_search            merit function of the line search, positive tangents
 nonlinear_elimination  separate solve for the few nodes that hold most of the residual
 forcing_terms          tolerances of inexact Newton
 linear_solver          systems with the tangent: options, Krylov method, steps that are one linear solve

@@ -1,4 +1,4 @@
-"""Line search of Newton's method: merit function, positive tangents, and clipped corrections.
+"""Line search of Newton's method: merit function and positive tangents.
 
 Equations: docs/theory.md#newtons-method.
 """
@@ -8,12 +8,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
-from ..mesh.domain import Domain
-from ..mesh.parallel import sum_over_ranks
 from .policy import DEFAULT_POLICY, SolverPolicy
 from .weak_callbacks import weak_callback
 
@@ -118,34 +115,6 @@ class MeritFunction:
         self._residual.destroy()
 
 
-def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec, policy: SolverPolicy = DEFAULT_POLICY) -> None:
-    """Shorten a correction x <- x - y (m) at nodes that it moves by more than a mean edge (collective).
-
-    With positive tangents a cell that is almost flat or is attached by one node has almost no stiffness in some
-    direction. Its nodes would be moved by tens of edges, and the line search would shorten the correction of all nodes.
-    The correction is not changed if the clipped one is no direction of descent.
-
-    Args:
-        domain: gives mean edge and nodes.
-        y: correction, changed in place.
-        r: gradient of the potential, N.
-        policy: share of the nodes that may be clipped.
-    """
-    increments = y.array_r.reshape(-1, domain.dim)
-    lengths, limit = np.sqrt((increments * increments).sum(axis=1)), domain.mean_edge_length
-    allowed = policy.max_clipped_nodes * domain.space.dofmap.index_map.size_global
-    # A longer correction of more nodes is the motion of a whole fragment.
-    while (clipped := sum_over_ranks(domain.comm, np.count_nonzero(lengths > limit))[0]) > allowed:
-        limit *= 2
-    if not clipped:
-        return
-    original = y.copy()
-    y.array_w[:] = (increments * np.minimum(1.0, limit / np.maximum(lengths, limit))[:, None]).reshape(-1)
-    if y.dot(r) <= 0:
-        original.copy(y)
-    original.destroy()
-
-
 class TangentModification(NamedTuple):
     """Modification by which tangents are made positive in an attempt.
 
@@ -214,12 +183,6 @@ class ModifiedNewton:
         self._largest_norm = max(self._largest_norm, norm)
         is_exact = norm < self._modification.exact_below * self._largest_norm
         return None if is_exact else self._modification.eigenvalue_floor
-
-    def clip_correction(self, y: PETSc.Vec) -> None:
-        """Clip a correction from a positive tangent (collective)."""
-        # Without inertia nothing but the correction tells where a part moves that is hardly attached.
-        if self._balance.scheme.inertia and self.eigenvalue_floor() is not None:
-            clip_correction(self._balance.domain, y, self.snes.getFunction()[0], self._policy)
 
     def has_stalled(self, norm: float, its: int) -> bool:
         """Return True if the attempt cycles between iterates, or leaves an unstable equilibrium.

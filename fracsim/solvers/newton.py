@@ -484,7 +484,6 @@ class NewtonSolver:
         """Shorten the step x <- x - y to what the terms of the balance allow (collective)."""
         if self._modified is not None:
             self._modified.merit.begin_line_search()
-            self._modified.clip_correction(y)
         if not self.balance.contact.limits_newton_steps:
             return
         share = self.balance.max_step_fraction(-y.array_r)

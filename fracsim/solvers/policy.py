@@ -46,8 +46,6 @@ class SolverPolicy:
     potential_round_off: float = 1e4 * float(np.finfo(float).eps)
     # Multiples of that round-off. Whole steps whose potential rises by no more are taken as steps near the solution.
     near_solution_ratio: float = 1e3
-    # Share of all nodes whose correction may be clipped. Clipping more would slow the motion of a whole fragment.
-    max_clipped_nodes: float = 0.03
     # Iterations without a smaller |r|, after which an attempt is given up: with exact tangents it cycles. With positive
     # ones |r| has also to be this multiple of its smallest value: a granite cylinder that breaks took 50 iterations to
     # diverge, and 3 with half the step.
