@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import dolfinx
 import meshio
@@ -100,6 +101,19 @@ def test_check_tells_what_contact_costs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    ("itself", "scheme", "breaks", "is_noted"),
+    [(True, "backward-euler", True, True), ("pieces", "backward-euler", True, False),
+     (True, "backward-euler", False, False), (True, "explicit", True, False)],
+)  # fmt: skip
+def test_check_notes_what_contact_inside_fragments_costs(
+    itself: bool | str, scheme: str, breaks: bool, is_noted: bool
+) -> None:
+    tables: dict[str, Any] = {"contact": {"itself": itself}} | ({"fracture": {"strength": 1e3}} if breaks else {})
+    lines = check_study(study(BAR, **tables, time={"scheme": scheme, "step": 1e-4, "end": 1e-3}))
+    assert ('contact.itself = "pieces" leaves it out' in "\n".join(lines)) == is_noted
+
+
+@pytest.mark.parametrize(
     ("step", "scheme", "energy", "told"),
     [(1e-2, "newmark", "neo-hookean", True), (1e-4, "newmark", "neo-hookean", False),
      (1e-2, "newmark", "linear", False), (1e-2, "generalized-alpha", "neo-hookean", False)],
@@ -136,6 +150,7 @@ def test_a_scene_builds_nothing_that_its_study_does_not_ask_for(tmp_path: Path) 
     code = f"""
 import sys
 from pathlib import Path
+from typing import Any
 from mpi4py import MPI
 from fracsim.study.reader import load_study
 from fracsim.deformable_run import Run
