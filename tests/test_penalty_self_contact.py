@@ -170,6 +170,30 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
+def test_crack_faces_are_extended_once_nodes_have_moved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A broken body in flight, whose faces stay retracted: each half width of the penalty they are tried again."""
+    scene, state = make_scene(
+        mesh={"file": two_blocks(tmp_path, 2, 0.03)}, material=SOFT, contact={}, fracture={"strength": 1e9},
+        time={"scheme": "explicit", "step": 0.002, "end": 10.0},
+    )  # fmt: skip
+    contact, _ = contact_of(scene)
+    scene.fracture.graph.break_edges(np.ones(len(scene.fracture.graph.broken), bool))
+    scene.fracture.mark_changed()
+    scene.balance.edges_broke(scene.fracture.graph.pattern)
+    state.v = np.full(positions(scene).size, 0.1 / np.sqrt(2))
+    state.settle()
+    times: list[float] = []
+    monkeypatch.setattr(contact.surface, "extend_faces", lambda u: times.append(state.t))
+    for retracted, expected in ((True, 8), (False, 0)):
+        times.clear()
+        contact.surface.has_retracted = retracted
+        # 0.1 m/s for the time of 8.5 half widths
+        start, motion = state.t, 8.5 * 0.5 * contact.surface.law.distance
+        while state.t < start + motion / 0.1:
+            march(scene, state, 1)
+        assert abs(len(times) - expected) <= (1 if expected else 0)
+
+
 @pytest.mark.parametrize("scheme", ["explicit", "backward-euler"])
 def test_a_body_of_single_nodes_has_no_fragments_to_touch(scheme: str) -> None:
     """All edges break, so that contact between fragments is left without a surface: nodes fly on in free fall."""

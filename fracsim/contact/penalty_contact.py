@@ -169,7 +169,7 @@ class PenaltyContact(Term):
             return
         self.surface.refresh(level.u_n)
         self.state.settle()
-        self.surface.extend_faces(level.u_n)
+        self.state.extend_faces(level)
         self._start_u = level.u_n
 
     def accept_step(self) -> None:

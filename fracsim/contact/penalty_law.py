@@ -44,6 +44,7 @@ class PenaltyPolicy:
         pair_width: width of the penalty between two obstacles from files in their gap at the start, where that is
             smaller than the width.
         min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
+        extension_motion: motion of nodes, in widths of the penalty, after which crack faces may be extended again.
     """
 
     near_gap: float = 3.0
@@ -52,6 +53,7 @@ class PenaltyPolicy:
     pair_share: float = 0.2
     pair_width: float = 0.5
     min_weight: float = 1e-6
+    extension_motion: float = 0.5
 
 
 PENALTY = PenaltyPolicy()

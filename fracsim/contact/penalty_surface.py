@@ -21,10 +21,12 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..array_types import Ints, Values
+from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks
 from .element_exchange import EXCHANGE, bounding_boxes, motion_diagonals, own_points
 from .mesh_obstacles import MeshObstacle, SurfacePart
+from .pair_search import max_length
 from .partitioned_surface import PartitionedSurface
 from .penalty_law import (
     PENALTY,
@@ -170,11 +172,17 @@ class IdleState:
         is_near: whether anything was near contact at the end of the last step.
         displacement: (owned dofs,) where nothing was near, m; None: not known.
         clearance: approach of any two nodes from there on before anything is near, m.
+        motion: bound of the motion of nodes since crack faces were extended last, m.
     """
 
     is_near: bool = False
     displacement: Values | None = None
     clearance: float = 0.0
+    motion: float = 0.0
+
+    def without_clearance(self) -> IdleState:
+        """The state of another surface."""
+        return replace(self, displacement=None, clearance=0.0)
 
 
 class PenaltyState:
@@ -234,8 +242,19 @@ class PenaltyState:
 
     def surface_changed(self) -> None:
         """Discard the clearance, as it is another surface."""
-        self._idle_state = IdleState(self._idle_state.is_near)
+        self._idle_state = self._idle_state.without_clearance()
         self.discard()
+
+    def extend_faces(self, level: TimeLevel) -> None:
+        """Extend retracted crack faces at the start of a step, once nodes have moved far enough (collective)."""
+        if not self._surface.has_retracted:
+            return
+        speed = max_over_ranks(self._comm, max_length(level.v_n.reshape(-1, self._dim)))
+        motion = self._idle_state.motion + level.dt * speed
+        is_due = motion >= PENALTY.extension_motion * self._surface.law.distance
+        self._idle_state = replace(self._idle_state, motion=0.0 if is_due else motion)
+        if is_due:
+            self._surface.extend_faces(level.u_n)
 
     def end_step(self, *, is_near: bool) -> None:
         """Note whether anything is near contact at the end of a step, on any rank (collective)."""
@@ -266,13 +285,13 @@ class PenaltyState:
                 if history is not part.pairs.history:
                     part.pairs.set_history(history)
         else:
-            self._restored, self._idle_state = histories, IdleState(idle.is_near)
+            self._restored, self._idle_state = histories, idle.without_clearance()
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Contacts of each part, on rank 0 (collective)."""
         self.settle()
-        arrays: dict[str, Values] = {}
+        arrays: dict[str, Values] = {"motion": np.array([self._idle_state.motion])}
         for index, history in enumerate(self._histories):
             if (of_ranks := gather(self._comm, history)) is not None:
                 of_all = PenaltyContacts.join(of_ranks)
@@ -284,4 +303,5 @@ class PenaltyState:
         names = [(f"points_{index}", f"contacts_{index}") for index in range(len(self._histories))]
         histories = [PenaltyContacts.from_array(cast("Ints", saved[key]), saved[rows]) for key, rows in names]
         is_near = any(len(history.points) for history in histories)
-        self.restore((histories, self._surface.surface_count, IdleState(is_near)))
+        (motion,) = saved["motion"]
+        self.restore((histories, self._surface.surface_count, IdleState(is_near, motion=float(motion))))
