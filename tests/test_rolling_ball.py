@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from fracsim.contact.rigid_body import RigidSystem
 from support.ranks import run_on_ranks
 from support.rolling import COLUMNS
+from support.scenes import make_scene
+
+Values = npt.NDArray[np.float64]
 
 
 @pytest.mark.ranks
@@ -38,3 +44,31 @@ def test_a_ball_that_begins_to_roll_takes_few_iterations() -> None:
         iterations.append(report.solve.newton_iterations)
     scene.destroy()
     assert max(iterations) <= 8 and sum(iterations) <= 60  # 6 and 53
+
+
+def test_a_ball_far_from_the_origin_falls_alike(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At 1 km positions are rounded by 1e-13 m, and the energy of contact by that times its forces. Without that error
+    the line search of the ball's pose refused solutions, for 1,300 evaluations at a time."""
+    count, evaluate = [0], RigidSystem.system
+
+    def counted(self: RigidSystem, *arguments: Any, exact: bool) -> tuple[Values, Values]:
+        count[0] += 1
+        assert count[0] < 300
+        return evaluate(self, *arguments, exact=exact)
+
+    monkeypatch.setattr(RigidSystem, "system", counted)
+    lost = []
+    for far in (0.0, 1000.0):
+        count[0] = 0
+        state = make_scene(
+            mesh={"builder": "box", "size": [0.4, 0.2, 0.1], "h": 0.05, "origin": [far] * 3},
+            material={"energy": "neo-hookean", "young": 1e5, "poisson": 0.3, "density": 1e3},
+            obstacle=[{"name": "ball", "shape": "sphere", "radius": 0.06, "at": [far + 0.2, far + 0.1, far + 0.165],
+                       "velocity": [0.1, 0.0, -1.0], "mass": 0.5, "friction": 0.3}],
+            boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "fix": "xyz"}],
+            time={"scheme": "newmark", "step": 0.002, "end": 0.1}, solver={},
+        )[1]  # fmt: skip
+        for _ in range(12):
+            state.advance()
+        lost.append(state.state.dissipated)
+    assert lost[0] > 1e-3 and lost[1] == pytest.approx(lost[0], rel=1e-6)

@@ -58,6 +58,7 @@ class RigidSolverPolicy:
 
 
 SOLVER = RigidSolverPolicy()
+EPSILON = float(np.finfo(float).eps)
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,8 @@ class RigidSystem:
             scale = self.energy_scale(z, derivatives)
             if not decrement > SOLVER.decrement_tolerance * scale:
                 break
-            fraction, tolerance = free(z, dz), SOLVER.round_off * (scale + abs(phi))
+            fraction = free(z, dz)
+            tolerance = SOLVER.round_off * (scale + abs(phi)) + weight * self._round_off_of_positions(derivatives)
             while fraction > SOLVER.min_fraction:
                 trial = [z_i + fraction * dz_i for z_i, dz_i in zip(z, dz, strict=True)]
                 trial_derivatives = contact(trial, True)
@@ -152,6 +154,12 @@ class RigidSystem:
         """Size of the energies of which Phi is the difference, J."""
         inertia = sum(step.energy_scale(z_i) for step, z_i in zip(self._steps, z, strict=True))
         return inertia + self._factor * self.level**2 * contact.energy
+
+    def _round_off_of_positions(self, contact: SystemDerivatives) -> float:
+        """Error of the energy of contact, J: forces times the round-off of positions at the centres."""
+        items = zip(self._steps, contact.bodies, strict=True)
+        forces = [(body.gradient, step.start.pose.centre) for step, body in items]
+        return sum(EPSILON * float(np.linalg.norm(force[: len(x)]) * np.linalg.norm(x)) for force, x in forces)
 
     def _free_potential(self, z: Sequence[Values]) -> float:
         return sum(step.free_potential(z_i) for step, z_i in zip(self._steps, z, strict=True))
