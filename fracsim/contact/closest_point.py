@@ -220,11 +220,13 @@ def _newton_step(points: FacetClosestPoints) -> Values:
     arms = x - points.position[:, None]
     Q = arms @ posed.curvature(points.position) @ arms.transpose(0, 2, 1) + mu * np.eye(x.shape[1])
     step = minimise_on_simplex(Q, points.corner_rise, barycentric) - barycentric
-    max_rate = -SEARCH.slope_reduction * np.einsum("kc,kc->k", points.corner_rise, step)
+    max_rate = np.maximum(-SEARCH.slope_reduction * np.einsum("kc,kc->k", points.corner_rise, step), 0.0)
+    # no descent: on a middle line of the obstacle, where its distance is not smooth
+    step[max_rate == 0] = 0.0
     for _ in range(SEARCH.max_trials):
         end = FacetClosestPoints(posed, x, mu, barycentric + step)
         rate = np.einsum("kc,kc->k", end.corner_rise, step)
-        if not (too_far := (rate > max_rate) & (max_rate > 0)).any():
+        if not (too_far := rate > max_rate).any():
             break
         step[too_far], max_rate[too_far] = step[too_far] / 2, max_rate[too_far] / 2
     return step

@@ -243,11 +243,11 @@ static double line_search(const Obstacle *o, const Facet *f, const Search *searc
                           double *slope, double *rise) {
   double trial[3], fraction = 1.0, low = 0.0, high = 1.0, rate_low = between(f, rise, step);
   const double steep = -search->slope_reduction * rate_low;
-  const int descends = rate_low < 0.0;
+  if (!(rate_low < 0.0)) return 0.0;  // on a middle line of the obstacle, where its distance is not smooth
   for (int a = 0; a < f->c; ++a) trial[a] = l[a] + step[a];
   slope_at(o, f, trial, slope, rise);
   double rate_high = between(f, rise, step);
-  if (!descends || !(rate_high > steep)) return fraction;
+  if (!(rate_high > steep)) return fraction;
   for (int k = 0; k < search->max_trials; ++k) {
     fraction = k % 3 == 2 ? (low + high) / 2.0 : low - rate_low * (high - low) / (rate_high - rate_low);
     for (int a = 0; a < f->c; ++a) trial[a] = l[a] + fraction * step[a];
