@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from ctypes import c_int64
 from dataclasses import dataclass
+from math import factorial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from ...meshes.topology import determinants
 from ..c_library import load_library
 
 SOURCE = Path(__file__).with_suffix(".c")
@@ -45,9 +47,7 @@ class PolyhedronMoments:
 
 def cone_volumes(x: Values) -> Values:
     """(m,) signed volumes of the cones from the origin over elements with corners (m, d, d)."""
-    if x.shape[2] == 2:
-        return np.asarray(x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2
-    return np.asarray(np.einsum("ni,ni->n", x[:, 0], np.cross(x[:, 1], x[:, 2]))) / 6
+    return determinants(x.transpose(1, 2, 0)) / factorial(x.shape[2])
 
 
 def moments(points: Values, elements: Ints, body: Ints, count: int) -> PolyhedronMoments:

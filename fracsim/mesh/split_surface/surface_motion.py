@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from ..parallel import RowRouting
 from ..simplices import is_split, local_edges
-from ..small_matrices import polar_rotation
+from ..small_matrices import cofactors, polar_rotation
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -70,9 +70,21 @@ class PointParents:
         return csr_matrix((np.repeat(1.0 / count, count), self.parents, self.start), shape=(len(count), self.nodes))
 
     @cached_property
+    def _with_arm(self) -> Ints:
+        """Positions in `parents` of those with a nonzero arm."""
+        return np.flatnonzero(self.arm.any(axis=1))
+
+    @cached_property
+    def _rotation_row(self) -> Ints:
+        """Index into `rotating_nodes` of each parent with a nonzero arm."""
+        row = np.full(self.nodes, -1)
+        row[self.rotating_nodes] = np.arange(len(self.rotating_nodes))
+        return row[self.parents[self._with_arm]]
+
+    @cached_property
     def rotating_nodes(self) -> Ints:
         """Nodes whose rotation is needed: parents with a nonzero arm."""
-        return np.unique(self.parents[np.any(self.arm != 0, axis=1)])
+        return np.unique(self.parents[self._with_arm])
 
     def mean(self, nodal: Values) -> Values:
         """(n, ...) mean of nodal values (nodes, ...) over the parents."""
@@ -89,12 +101,10 @@ class PointParents:
 
         `rotation`: (rotating_nodes, d, d).    `u`: (nodes, d), m.
         """
-        row = np.full(self.nodes, -1)
-        row[self.rotating_nodes] = np.arange(len(self.rotating_nodes))
-        entry = np.flatnonzero(np.any(self.arm != 0, axis=1))
-        arm = self.arm[entry]
+        arm = self.arm[self._with_arm]
         displacement = u[self.parents]
-        displacement[entry] += np.einsum("nij,nj->ni", rotation[row[self.parents[entry]]], arm) - arm
+        turned = np.einsum("nij,nj->ni", rotation[self._rotation_row], arm)
+        displacement[self._with_arm] += turned - arm
         return self._mean(displacement)
 
 
@@ -121,20 +131,22 @@ class NodalGradients:
         span = topology.points[self._cells]
         # rows X_k - X_0
         span = span[:, 1:] - span[:, :1]
-        # d! V (X_k - X_0)^-1
-        self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]
+        # d! V (X_k - X_0)^-T
+        cofactor = cofactors(span)
+        determinant = np.einsum("nj,nj->n", span[:, 0], cofactor[:, 0])
+        self._inverse = cofactor * np.sign(determinant)[:, None, None]
         target = self.row[self._cells]
         cell, corner = np.nonzero(target >= 0)
         ones = np.ones(len(cell))
         self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(self._nodes), len(self._cells)))
-        volume = part.sum_at(self._nodes, (self._sum @ np.abs(np.linalg.det(span)))[:, None])
+        volume = part.sum_at(self._nodes, (self._sum @ np.abs(determinant))[:, None])
         self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
 
     def __call__(self, u: Values) -> Values:
         """(rows, d, d) averages for displacements u (N, d), m (collective)."""
         d, moved = self._dim, u[self._cells]
         moved = moved[:, 1:] - moved[:, :1]
-        gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
+        gradient = np.einsum("nkj,nki->nij", self._inverse, moved)
         mean = self._part.sum_at(self._nodes, self._sum @ gradient.reshape(-1, d * d)) * self._per_volume
         return mean.reshape(-1, d, d)
 
