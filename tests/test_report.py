@@ -147,6 +147,23 @@ def test_error_against_run_time(runs: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
+def test_the_peak_of_a_reaction_is_that_at_which_edges_break(tmp_path: Path) -> None:
+    """Quasi-static: the load falls within the step that breaks. Its peak is that of summary.json in every table."""
+    quasi = {"scheme": "quasi-static", "step": 0.008, "end": 0.024}
+    assert (
+        fracsim("run", write_study(tmp_path / "strip.toml", STRIP, time=quasi), "-o", tmp_path / "run").returncode == 0
+    )
+    summary, (run,) = json.loads((tmp_path / "run" / "summary.json").read_text()), find_runs([tmp_path / "run"])
+    peak = summary["peak_reactions"]["reaction_grip_x"]
+    assert peak > 1.2 * run.history["reaction_grip_x"].max(), "it is reached within a step"
+    assert run.quantity("peak_reaction_grip_x") == pytest.approx(peak, rel=1e-9)
+    (tmp_path / "curve.csv").write_text(f"motion_grip_x,reaction_grip_x\n0,0\n0.02,{peak:.17g}\n")
+    make_report([tmp_path / "run"], tmp_path / "page.html", references=[tmp_path / "curve.csv"])
+    (row,) = table(tmp_path / "page" / "references.csv")
+    assert float(row["peak, relative"]) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_a_reference_that_is_the_run_is_no_distance_away(runs: Path, tmp_path: Path) -> None:
     (run,) = find_runs([runs / "strip"])
     x, y = run.history["motion_grip_x"], run.history["reaction_grip_x"]

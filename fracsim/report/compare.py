@@ -256,7 +256,7 @@ def _deviation(run: RunData, reference: ReferenceCurve, y: str) -> tuple[TableCe
     """Peak of the run, peak of the reference, relative deviation of the peak, relative rms deviation."""
     run_x, run_y = run.history[reference.x], run.history[y]
     x, expected = reference.columns[reference.x], reference.columns[y]
-    peak, reference_peak = float(np.max(np.abs(run_y), initial=0.0)), float(np.max(np.abs(expected)))
+    peak, reference_peak = run.peak(y), float(np.max(np.abs(expected)))
     order, by_x = (np.argsort(values, kind="stable") for values in (run_x, x))
     x, expected = x[by_x], expected[by_x]
     common = (x >= run_x.min(initial=math.inf)) & (x <= run_x.max(initial=-math.inf))

@@ -67,7 +67,7 @@ class RunData:
         kind, _, column = name.partition("_")
         if column in self.history and kind in ("peak", "final"):
             values = self.history[column]
-            return float("nan") if not len(values) else float(np.max(np.abs(values)) if kind == "peak" else values[-1])
+            return float("nan") if not len(values) else self.peak(column) if kind == "peak" else float(values[-1])
         if _is_number(self.summary.get(name)):
             return float(self.summary[name])
         columns, figures = ", ".join(self.history), ", ".join(k for k, v in self.summary.items() if _is_number(v))
@@ -75,6 +75,12 @@ class RunData:
             f"--quantity {name}: {self.name} has no such figure. Give peak_COLUMN or final_COLUMN with one of the "
             f"columns {columns}; or one of {figures or 'the figures of summary.json, which it does not have'}"
         )
+
+    def peak(self, column: str) -> float:
+        """Largest absolute value of a column; of a reaction also as edges broke in a step, as in `peak_reactions`."""
+        onset = column.replace("reaction_", "onset_", 1)
+        columns = {column, onset} & {*self.history}
+        return max(float(np.max(np.abs(self.history[name]), initial=0.0)) for name in columns)
 
     def history_column(self, name: str, option: str) -> Values:
         """Column of the history. Raises InputError, naming the command-line option, if there is none."""
