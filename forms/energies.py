@@ -141,6 +141,10 @@ class LinearElastic(_PlaneStrain):
         """Return the energy density, J/m^3."""
         return hooke(self, self.strain(F))
 
+    def thickness_stretch(self, F: Expr) -> Expr | float:
+        """Return F33 = 1 + eps33, eps33 = -lambda*/(2 mu) tr(eps), in plane stress; 1 in plane strain."""
+        return 1 - self.lmbda / (2 * self.mu) * ufl.tr(small_strain(F)) if self.plane_stress else 1.0
+
 
 @dataclass(frozen=True)
 class Corotated(_PlaneStrain):

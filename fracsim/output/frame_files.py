@@ -128,8 +128,12 @@ def _energy_density(stress: Stress) -> Expr:
 
 
 def _equivalent_strain(stress: Stress) -> Expr:
-    """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (Mandal et al. 2022, figure 2)."""
-    E = green_strain(embed(deformation_gradient(stress.u), 1.0))
+    """Equivalent Green-Lagrange strain sqrt(2/3 e:e), e the deviator of E (Mandal et al. 2022, figure 2).
+
+    E is 3 x 3: in plane stress E33 is that of the thickness.
+    """
+    F = deformation_gradient(stress.u)
+    E = green_strain(embed(F, stress.energy.thickness_stretch(F)))
     return ufl.sqrt(2 / 3 * ufl.inner(ufl.dev(E), ufl.dev(E)))
 
 
