@@ -471,6 +471,7 @@ def test_quasi_static_dissipation_is_the_plastic_work() -> None:
 def test_energy_balance(scheme: str) -> None:
     """Work = elastic + kinetic + dissipated as dt -> 0, with most of the work gone into flow."""
     gaps = []
+    undamped = {"rho": 1.0} if scheme == "generalized-alpha" else {}
     for steps in (100, 200):
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
@@ -480,7 +481,7 @@ def test_energy_balance(scheme: str) -> None:
                 {"on": "right", "traction": {"time": [0, 4], "value": [[0.0, 0.0], [0.03, 0.002]]}},
             ],
             plasticity={"yield_stress": 0.02, "hardening": 0.02},
-            time={"scheme": scheme, "step": 4.0 / steps, "end": 4.0, "rho": 1.0},
+            time={"scheme": scheme, "step": 4.0 / steps, "end": 4.0} | undamped,
         )
         report = march(scene, state)[-1]
         gaps.append(abs(state.work - report.kinetic - report.elastic - state.dissipated) / state.work)

@@ -209,3 +209,22 @@ def test_a_folder_is_not_the_packaged_study_of_its_name(tmp_path: Path, monkeypa
     assert find_study("loaf") == Path("loaf")
     for name in ("there/is/none", "nothing"):
         assert find_study(name) == Path(name)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "key", "value", "owner"),
+    [
+        ("generalized-alpha", "gamma", 0.6, "newmark"),
+        ("newmark", "rho", 0.5, "generalized-alpha"),
+        ("backward-euler", "rho", 0.5, "generalized-alpha"),
+        ("explicit", "beta", 0.3, "newmark"),
+        ("quasi-static", "rho", 0.0, "generalized-alpha"),
+    ],
+)
+def test_a_parameter_of_another_scheme_is_refused(scheme: str, key: str, value: float, owner: str) -> None:
+    """It would do nothing. Its default is accepted: study.toml of a run has it."""
+    with pytest.raises(InputError, match=f'{key} = .* is of scheme = "{owner}" and does nothing with'):
+        study(STRIP, time={"scheme": scheme, key: value})
+    study(
+        STRIP, time={"scheme": owner, "beta": 0.4, key: value} if owner == "newmark" else {"scheme": owner, key: value}
+    )

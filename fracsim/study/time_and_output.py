@@ -102,10 +102,22 @@ class BaseTimeSettings(StudyTable):
             raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
         if self.breaking_step is not None:
             self._check_breaking_step(self.breaking_step)
+        self._check_other_parameters()
         self.scheme_object.check_parameters()
         if not self.scheme_class.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
+
+    def _check_other_parameters(self) -> None:
+        """Refuse parameters of other schemes; study.toml of a run has their defaults."""
+        for name, owner in SCHEMES.items():
+            for parameter in fields(owner):
+                value = getattr(self, parameter.name)
+                if parameter.name not in self.scheme_parameters and value != parameter.default:
+                    raise ValueError(
+                        f'{parameter.name} = {value:g} is of scheme = "{name}" and does nothing with '
+                        f'scheme = "{self.scheme}": remove it, or choose that scheme'
+                    )
 
     def _check_breaking_step(self, step: float) -> None:
         if not self.scheme_class.implicit:
