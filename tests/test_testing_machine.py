@@ -108,12 +108,25 @@ def test_the_peak_is_met_to_the_length_of_breaking_steps(tmp_path: Path) -> None
     )
     summary = json.loads((tmp_path / "coarse" / "summary.json").read_text())
     assert summary["steps_retaken"] >= 5 and summary["load"]["of"] == "grip"
-    assert summary["load"]["peak"] == pytest.approx(peak) and summary["load"]["ended_the_run"]
+    assert summary["load"]["peak"] == pytest.approx(np.abs(coarse["onset_grip_x"]).max())
+    assert peak <= summary["load"]["peak"] <= (1 + share) * STRENGTH * HEIGHT and summary["load"]["ended_the_run"]
     # it ended with the load, in the step in which that fell
     assert coarse["time"][-1] < 0.9 and abs(coarse["reaction_grip_x"][-1]) <= 0.2 * peak
     assert (
         np.abs(coarse["reaction_grip_x"][:-1]) > 0.2 * np.maximum.accumulate(np.abs(coarse["reaction_grip_x"]))[:-1]
     ).all()
+
+
+def test_the_load_falls_from_that_at_which_edges_break(tmp_path: Path) -> None:
+    """In steps of 12 mm edges break at 24 mm, beyond f_t L / E = 20 mm. The peak is that of peak_reactions.
+
+    The load of the step before, 0.6 f_t A, is no peak above f_t A.
+    """
+    run(SMOOTH, tmp_path / "out", time={"step": 0.2, "until": {"drop": 0.8, "above": STRENGTH * HEIGHT}})
+    load = (summary := json.loads((tmp_path / "out" / "summary.json").read_text()))["load"]
+    assert load["peak"] == pytest.approx(1.2 * STRENGTH * HEIGHT, rel=1e-3)
+    assert load["peak"] == pytest.approx(summary["peak_reactions"]["reaction_grip_x"], rel=1e-3)
+    assert load["ended_the_run"] and load["peak_time"] == pytest.approx(0.4)
 
 
 def test_a_step_taken_again_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -348,7 +348,7 @@ class LoadDropMonitor:
         name: name of the probe or obstacle.
         drop_fraction: relative drop from the peak that ends the run.
         min_peak: lower peaks do not count, N.
-        peak: largest force so far, N.
+        peak: largest force so far, also as edges broke within a step, N.
         peak_time: time of the peak, s.
         last_load: force in the last step, N.
         has_dropped: True if the force has dropped far enough.
@@ -374,12 +374,17 @@ class LoadDropMonitor:
             figures: columns of history.csv by name.
             broken: number of broken edges so far.
         """
-        prefixes = tuple(f"{kind}_{self.name}_" for kind in ("reaction", "contact"))
-        self.last_load = float(np.linalg.norm([value for name, value in figures.items() if name.startswith(prefixes)]))
-        if self.last_load > self.peak:
-            self.peak, self.peak_time = self.last_load, t
+        self.last_load = max(self._force(figures, kind) for kind in ("reaction", "contact"))
+        largest = max(self.last_load, self._force(figures, "onset"))
+        if largest > self.peak:
+            self.peak, self.peak_time = largest, t
         fallen = self.last_load <= (1 - self.drop_fraction) * self.peak and self.peak > self.min_peak
         self.has_dropped = fallen and (broken > 0 or not self._breaks)
+
+    def _force(self, figures: dict[str, float], kind: str) -> float:
+        """Magnitude of the force in the columns `kind`_NAME_x, ..., N; 0 if there are none."""
+        prefix = f"{kind}_{self.name}_"
+        return float(np.linalg.norm([value for name, value in figures.items() if name.startswith(prefix)]))
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Values for `from_checkpoint`."""
