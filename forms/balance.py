@@ -44,26 +44,26 @@ def elastic_energy(
 
 
 def viscous_work(
-    energy: Energy, v: Expr, u_n: Expr, w: Expr, dx: ufl.Measure, *, b: Expr | float, chi: Expr | float = 1.0
+    energy: Energy, v: Expr, u_p: Expr, w: Expr, dx: ufl.Measure, *, b: Expr | float, chi: Expr | float = 1.0
 ) -> Form:
-    """Return the stiffness-proportional damping, int chi b (C : Edot) : sym(F_n^T grad w) dX, Edot = sym(F_n^T grad v).
+    """Return the stiffness-proportional damping, int chi b (C : Edot) : sym(F_p^T grad w) dX, Edot = sym(F_p^T grad v).
 
     At small strain this is Rayleigh's b K v. It always dissipates, int b Edot : C : Edot.
 
     Args:
         energy: elastic energy.
         v: velocity, m/s.
-        u_n: displacement at the start of the step, m.
+        u_p: displacement at the time of v, predicted at the start of the step, m.
         w: test function.
         dx: measure of the body.
         b: damping coefficient, s.
         chi: degradation.
     """
-    # K of the deformed body would be neither positive nor independent of the rotation of a stressed body. F of the
-    # start of the step keeps the form linear in v; a rigid spin w then has a strain rate of about w^2 dt, which
-    # vanishes with dt.
-    F_n = ufl.Identity(u_n.ufl_shape[0]) if energy.linear else deformation_gradient(u_n)
-    rate, virtual = (ufl.sym(F_n.T * ufl.grad(field)) for field in (v, w))
+    # K of the deformed body would be neither positive nor independent of the rotation of a stressed body. A predicted F
+    # keeps the form linear in v. With u_p = u_n + dt v_n a rigid spin w has a strain rate of about w^4 dt^3. With F of
+    # the start of the step it would be w^2 dt, which brakes the spin.
+    F_p = ufl.Identity(u_p.ufl_shape[0]) if energy.linear else deformation_gradient(u_p)
+    rate, virtual = (ufl.sym(F_p.T * ufl.grad(field)) for field in (v, w))
     return chi * b * ufl.inner(elastic_stress(energy, rate), virtual) * dx(metadata=stress_quadrature(w))
 
 

@@ -244,26 +244,25 @@ def test_gravity_on_a_free_body_is_free_fall() -> None:
         np.testing.assert_allclose(state.u, expected, atol=SOLVED)
 
 
-def test_damping_does_not_hold_a_rigid_spin_back() -> None:
+@pytest.mark.parametrize("scheme", ("newmark", "generalized-alpha", "backward-euler"))
+def test_damping_does_not_hold_a_rigid_spin_back(scheme: str) -> None:
     """Stiffness damping of a nonlinear body sees strain rates only: a rigidly turning body loses nothing to it.
 
-    The strain rate is taken with F at the start of the step, off by w^2 dt: the loss falls with dt^2 to nothing (but
-    for the vibration about the stretched shape, a share (w L / c0)^2 = 2e-5 of the energy).
+    The strain rate is taken with a predicted F. With F of the start of the step 1 to 4 % were lost in 100 steps.
     """
     losses, stiff = [], 2e5
-    for steps in (50, 100, 200):
+    for steps in (25, 50, 100):
         scene, state = make_scene(
             mesh=MESH,
             material=MATERIAL | {"energy": "neo-hookean", "young": stiff},
             initial={"spin": [1.0]},
             damping={"stiffness": 1e-4},
-            time={"scheme": "newmark", "step": 1.0 / steps, "end": 1.0},
+            time={"scheme": scheme, "step": 1.0 / steps, "end": 1.0},
         )
         kinetic = scene.balance.energies.kinetic_energy(state.v)
         march(scene, state)
         losses.append(abs(state.dissipated) / kinetic)
-    assert slopes(losses)[-1] == pytest.approx(2, abs=0.2)
-    assert abs(4 * losses[2] - losses[1]) / 3 < 0.1 * losses[2]
+    assert losses[-1] < 1e-4 and min(slopes(losses)) > 2.5
 
 
 def test_step_halving_reaches_the_same_end() -> None:

@@ -65,7 +65,7 @@ class Drag(Term):
 
 
 class Viscosity(Term):
-    """Stiffness-proportional damping int chi b (C : Edot) : sym(F_n^T grad w) dX (forms.balance.viscous_work).
+    """Stiffness-proportional damping int chi b (C : Edot) : sym(F_p^T grad w) dX (forms.balance.viscous_work).
 
     Attributes:
         b: coefficient, s.
@@ -77,13 +77,14 @@ class Viscosity(Term):
         domain = assembler.domain
         self.b = b
         self._assembler, self._u, self._stress, self.linear = assembler, u, stress, stress.linear
-        self._u_n, self._u_v = fem.Function(domain.space), fem.Function(domain.space)
+        self._u_p, self._u_v = fem.Function(domain.space), fem.Function(domain.space)
         self._c_v = fem.Constant(domain.mesh, np.float64(0.0))
         self._form = CellForm(self.virtual_work(ufl.TestFunction(domain.space), cell_measure(domain)))
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Take the displacement at the start of the step and the velocity of the time level."""
-        for field, values in ((self._u_n, level.u_n), (self._u_v, level.u_v)):
+        """Predict the displacement at the time level, and take its velocity."""
+        predicted = level.u_n + level.fraction * level.dt * level.v_n
+        for field, values in ((self._u_p, predicted), (self._u_v, level.u_v)):
             field.x.array[: len(values)] = values
             field.x.scatter_forward()
         self._c_v.value = level.c_v
@@ -92,7 +93,7 @@ class Viscosity(Term):
         """Virtual work of the viscous stress, N m."""
         stress, rate = self._stress, self._c_v * (self._u - self._u_v)
         chi = stress.degradation_factor
-        return viscous_work(stress.material.energy, rate, self._u_n, w, dx, b=self.b, chi=chi)
+        return viscous_work(stress.material.energy, rate, self._u_p, w, dx, b=self.b, chi=chi)
 
     def tangent_form(self, v: Expr, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Derivative of the virtual work in the direction v."""
