@@ -18,7 +18,7 @@ from fracsim.errors import Stopped
 from fracsim.mesh import interpenetration
 from fracsim.mesh.interpenetration import find_interpenetration
 from fracsim.scene import build_scene
-from support.scenes import make_study
+from support.scenes import make_study, positions
 from support.solids import lattice
 
 Values = npt.NDArray[np.float64]
@@ -79,6 +79,29 @@ def test_a_needle_does_not_pass_between_the_points(
     tables = struck(radius=0.01, at=[0.5, 0.5]) | {"time": STRIP["time"] | {"scheme": scheme}}
     (note,) = notes(tables, tmp_path, capsys)
     assert "the obstacle striker never met the body: it came no nearer than 0.37 m" in note
+
+
+@pytest.mark.parametrize(("stiffness", "told"), ((1e3, True), (None, False)))
+def test_a_press_that_enters_the_body_in_explicit_steps(
+    stiffness: float | None, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A soft penalty lets a plate, which sinks at 1 m/s, into the strip; the note has the depth at the end.
+
+    The depth is that of the points in contact, which lie inside of the facets: nodes at the ends of the strip are 5 %
+    deeper.
+    """
+    plate = {"name": "plate", "shape": "plane", "at": [0.0, 0.101], "normal": [0.0, -1.0], "velocity": [0.0, -1.0]}
+    contact = {"itself": False} | ({} if stiffness is None else {"stiffness": stiffness})
+    tables = STRIP | {"obstacle": [plate], "contact": contact, "boundary": [{"on": "bottom", "fix": "xy"}]}
+    tables |= {"time": STRIP["time"] | {"scheme": "explicit", "end": 0.02}}
+    run = begun(tables, tmp_path)
+    run()
+    found = [line for line in capsys.readouterr().err.splitlines() if "plate was inside the body by up to" in line]
+    assert bool(found) == told
+    if told:
+        top = positions(run.scene)[:, 1] + run.state.u.reshape(-1, 2)[:, 1]
+        depth = float(found[0].split("up to ")[1].split(" m,")[0])
+        assert depth >= 0.95 * (top.max() - (0.101 - 0.02)) > 0.1 * run.scene.domain.mean_edge_length
 
 
 def test_a_table_that_moves_along_is_not_fast(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

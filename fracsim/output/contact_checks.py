@@ -72,7 +72,9 @@ class ObstacleContactMonitor:
         closing = self._closing_over_ranks()
         missed = [self._missed_note(name) for name in self.least_gap if done and name not in touched]
         fast = [_speed_note(name, self._edge, *closing[name]) for name in touched if closing[name][0] > self._edge]
-        return [*missed, *fast]
+        # from a tenth of a mean edge on
+        deep = [name for name in touched if self.least_gap[name][0] < -0.1 * self._edge]
+        return [*missed, *fast, *(_overlap_note(name, self._edge, *self.least_gap[name]) for name in deep)]
 
     def _closing_over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`largest_closing` of the rank on which it is largest (collective)."""
@@ -90,6 +92,14 @@ def _speed_note(name: str, edge: float, closing: float, t: float, dt: float) -> 
         f"{name} and the body met faster than the step can follow: at t = {t:g} s they closed in by {closing:.3g} m in "
         f"{dt:g} s, and an edge of the mesh is {edge:.3g} m; a time.step of {_round_down(dt * edge / closing):g} s "
         "would do"
+    )
+
+
+def _overlap_note(name: str, edge: float, gap: float, t: float) -> str:
+    """Sentence about an obstacle within the body, with the least gap (m), its time (s) and the mean edge (m)."""
+    return (
+        f"{name} was inside the body by up to {-gap:.3g} m, {-gap / edge:.2g} of a mean edge, at t = {t:g} s: a higher "
+        "contact.stiffness or a smaller mesh.h keeps them apart (docs/accuracy.md#contact)"
     )
 
 
