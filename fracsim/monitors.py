@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         SelfContactTerm,
     )
     from .output.history import History
-    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor
+    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor, RotationStressMonitor
     from .scene import Scene
     from .study import Study
     from .timestepping.state import State
@@ -65,6 +65,7 @@ class RunMonitors:
         obstacle_overlap: overlap of obstacles with one another; None without several obstacles, one of them free.
         interpenetration: of fragments; None without a surface.
         intersections: of facets in contact of the body with itself; None without it, and in explicit steps.
+        rotation: stress from rotation in a step; None without fracture, and with schemes that add none.
         load_drop: ends the run when the load has dropped; None without `time.until`.
     """
 
@@ -78,9 +79,9 @@ class RunMonitors:
         self.energy_balance = EnergyBalanceMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
         self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
         self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
-        self.intersections = _intersection_monitor(scene)
+        self.intersections, self.rotation = _intersection_monitor(scene), _rotation_monitor(scene)
         of_contact = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.intersections)
-        optional = (*of_contact, self.load_drop)
+        optional = (*of_contact, self.load_drop, self.rotation)
         self._optional: list[Monitor] = [monitor for monitor in optional if monitor is not None]
 
     @property
@@ -94,6 +95,8 @@ class RunMonitors:
             self.contact_monitor.record_step(state, report.dt, figures)
         if self.load_drop is not None:
             self.load_drop.record_step(state.t, figures, broken)
+        if self.rotation is not None:
+            self.rotation.record_step(state, report.dt)
         self.energy_balance.record_step(report, state)
 
     def record_frame(self, t: float) -> None:
@@ -103,6 +106,8 @@ class RunMonitors:
             self.obstacle_overlap.record_frame(t)
         if self.intersections is not None:
             self.intersections.record_frame(t)
+        if self.rotation is not None:
+            self.rotation.record_frame(t)
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Return what a checkpoint stores (collective)."""
@@ -149,6 +154,8 @@ class RunMonitors:
             notes += self.interpenetration.notes(implicit=time.scheme_class.implicit)
         if self.intersections is not None:
             notes += self.intersections.notes()
+        if self.rotation is not None:
+            notes += self.rotation.notes()
         return notes
 
 
@@ -192,6 +199,16 @@ def _intersection_monitor(scene: Scene) -> IntersectionMonitor | None:
 
     (term,) = [term for term in scene.balance.terms if term.name == "contact"]
     return IntersectionMonitor(cast("SelfContactTerm", term))
+
+
+def _rotation_monitor(scene: Scene) -> RotationStressMonitor | None:
+    """Return the monitor of stress from rotation, if forces balance between the ends of a step and edges may break."""
+    stress, alpha_f = scene.balance.stress, scene.balance.scheme.alpha_f
+    if scene.fracture is None or not 0 < alpha_f < 1 or stress.energy.linear:
+        return None
+    from .output.result_checks import RotationStressMonitor
+
+    return RotationStressMonitor(stress, scene.fracture, alpha_f)
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

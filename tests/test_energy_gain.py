@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from cases import STRIP, study
 from fracsim.deformable_run import Run
 from fracsim.output.result_checks import EnergyBalanceMonitor, negligible_energy
 from fracsim.output.summary import irregular_event_text
@@ -148,3 +149,24 @@ def test_stress_that_is_no_number_is_counted() -> None:
     scene.fracture()
     assert scene.stepper.failure_counts()["cells_not_finite"] == scene.domain.cell_count
     assert walk.t == 0
+
+
+@pytest.mark.parametrize(
+    ("scheme", "step", "told"),
+    [("generalized-alpha", 0.01, True), ("generalized-alpha", 1e-3, False), ("newmark", 0.01, False)],
+)
+@pytest.mark.parametrize("order", [1, 2])
+def test_stress_from_rotation_in_a_step_is_told(
+    order: int, scheme: str, step: float, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A bar that spins at w = 10 rad/s: rho w^2 L^2 / 8 is a tenth of its strength. With rho = 0.8 steps of 0.1 rad add
+    E (20/81) 0.1^2 / 2 = 3.1 of it."""
+    spinning = study(
+        STRIP, mesh={"size": [0.4, 0.1], "h": 0.05, "order": order}, boundary=[], probe=[], initial={"spin": [10.0]},
+        material={"young": 5e7, "poisson": 0.0}, fracture={"strength": 2e4},
+        time={"scheme": scheme, "step": step, "end": 0.02}, output={"every": 1, "picture": False, "surface": False},
+    )  # fmt: skip
+    Run(build_scene(MPI.COMM_SELF, spinning), tmp_path)()
+    heard = capsys.readouterr().err
+    assert ("cells rotated by 0.1 rad in the step to t = 0.01 s" in heard) == told
+    assert ("a stress of 3.1 of the strength" in heard) == told

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 from mpi4py import MPI
 
 from ..mechanics.stress import Stress
@@ -41,6 +42,7 @@ class CheckTolerances:
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
         min_tension: share of the largest stress below which a principal stress is round-off.
+        rotation_stress: share of the strength from which stress that comes from rotation in a step is noted.
         cells_per_part: cells whose Jacobians are computed at a time.
     """
 
@@ -49,6 +51,7 @@ class CheckTolerances:
     single_step_share: float = 0.5
     min_jacobian: float = 1e-6
     min_tension: float = 1e-9
+    rotation_stress: float = 0.1
     cells_per_part: int = 16_000
 
 
@@ -215,6 +218,75 @@ class InvertedCellMonitor:
             f"t = {self.first_time:g} s, smallest J = {self.min_jacobian:.2g}): the result is not to be trusted from "
             f"there on; {remedy}"
         )
+
+
+class RotationStressMonitor:
+    """Largest stress that a scheme adds to cells that rotate, as a share of their strength.
+
+    Where forces balance at (1 - alpha_f) u_{n+1} + alpha_f u_n, a cell that rotates by an angle theta in a step is
+    shortened there. At the end of the step it is longer by alpha_f (1 - alpha_f) theta^2 / 2.
+
+    Attributes:
+        largest: share of the strength so far, angle in rad and time in s; zeros at the start.
+    """
+
+    _cells: Ints
+
+    def __init__(self, stress: Stress, fracture: FracturePass, alpha_f: float) -> None:
+        """Start without any frame; `alpha_f`: weight of the start of a step in the balance of forces."""
+        self._stress, self._fracture, self._factor = stress, fracture, alpha_f * (1 - alpha_f) / 2
+        self._velocity = fem.Function(stress.domain.space)
+        self._dt, self._cells = 0.0, np.arange(stress.domain.cell_count, dtype=np.int64)
+        self.largest = (0.0, 0.0, 0.0)
+
+    def record_step(self, state: State, dt: float) -> None:
+        """Record the velocity at the end of a step of dt in s."""
+        self._velocity.x.array[: len(state.v)], self._dt = state.v, dt
+
+    def record_frame(self, t: float) -> None:
+        """Record the rotation of cells that carried stress at the frame before, at time t in s (collective)."""
+        domain, strength = self._stress.domain, getattr(self._fracture.criterion, "strength", None)
+        if strength is None:
+            return
+        self._velocity.x.scatter_forward()
+        cells, self._cells = self._cells, np.flatnonzero(~self._fracture.graph.split)
+        velocities = self._velocity.x.array.reshape(-1, domain.dim)[domain.cell_nodes[cells]]
+        corners = self._stress.cell_corners(cells)
+        edges, rates = (values[:, 1:] - values[:, :1] for values in (corners, velocities))
+        solid = determinants(edges.transpose(1, 2, 0)) != 0
+        cells, gradient = cells[solid], np.linalg.solve(edges[solid], rates[solid])
+        skew = (gradient - gradient.transpose(0, 2, 1)) / 2
+        angle = self._dt * np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)
+        young = np.broadcast_to(self._stress.material.young, domain.cell_count)[cells]
+        share = young * self._factor * angle**2 / strength.minimum_in(cells)
+        # a rank without cells has no row
+        rows = [(float(share[cell]), float(angle[cell]), t) for cell in np.argsort(share)[-1:]]
+        self.largest = max(
+            [self.largest, *(row for rows_of_rank in domain.comm.allgather(rows) for row in rows_of_rank)]
+        )
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"rotation_stress": list(self.largest)}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.largest = tuple(monitors.get("rotation_stress", self.largest))
+
+    def summary(self) -> dict[str, Any]:
+        """Return nothing: it has no part of summary.json."""
+        return {}
+
+    def notes(self) -> list[str]:
+        """Sentence about stress that comes from rotation, if it is more than a tenth of the strength."""
+        share, angle, t = self.largest
+        if share < CHECK_TOLERANCES.rotation_stress:
+            return []
+        return [
+            f"cells rotated by {angle:.2g} rad in the step to t = {t:g} s: the scheme stretches them by "
+            f"{self._factor:.2g} of its square, a stress of {share:.2g} of the strength, which may break them; "
+            'try time.scheme = "newmark" or "backward-euler", or a shorter time.step'
+        ]
 
 
 def untested_balance_note(solver: dict[str, Any], *, is_linear: bool) -> str:
