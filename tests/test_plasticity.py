@@ -265,6 +265,26 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
         )
 
 
+@pytest.mark.parametrize("energy", FINITE)
+def test_flow_at_a_pressure_beyond_yield_dissipates_nothing(energy: str) -> None:
+    """Frobenius norm: the pressure alone exceeds Y, so that no deviator is left, and what flows carries no shear stress.
+
+    A step dissipated -K alpha^2 / 2 J/m^3 before, alpha its flow.
+    """
+    hardening = 0.1
+    scene, _ = homogeneous(energy, yield_stress=0.01, hardening=hardening, measure="frobenius")
+    scene.stepper.inelastic.flow.begin_step(0.1)
+    deform(scene, np.diag([1.02, 1.02, 1.021]))
+    scene.stepper.inelastic.flow()
+    before = plastic_strain(scene).copy()
+    scene.stepper.inelastic.flow.begin_step(0.1)
+    deform(scene, np.diag([1.03, 1.03, 1.0315]))
+    lost = scene.stepper.inelastic.flow()
+    flowed = float((plastic_strain(scene) - before).mean())
+    assert flowed > 1e-4
+    assert abs(lost) < 0.01 * hardening * flowed**2 / 2
+
+
 def two_halves(folder: Path) -> Path:
     """BAR of cells of 0.25 m in a file whose right half is the region "stiff"."""
     mesh = BUILDERS["box"](size=(1.0, 0.5, 0.5), h=0.25).build()

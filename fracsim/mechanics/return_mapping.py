@@ -164,16 +164,22 @@ class ReturnMapping:
         vm, p = stress[:, 0], stress[:, 1]
         return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
 
+    def _yielding(self, Y: Values, pressure: Values) -> Values:
+        """(n,) von Mises stress at yield, Pa: Y, or what the pressure leaves of |sigma| = Y."""
+        return np.sqrt(np.maximum(1.5 * (Y**2 - 3 * pressure**2), 0.0)) if self.plastic.frobenius else Y
+
     def _lost(self, block: _Return) -> float:
         """Energy dissipated by a block of points, J; updates their accumulated strain."""
         plastic, points = self.plastic, block.points
         flowed = block.beta * block.size
         plastic.accumulated_strain[points] = block.alpha + flowed
-        gain = plastic.flow_stress(plastic.accumulated_strain[points], points) - plastic.flow_stress(
-            block.alpha, points
-        )
         # the loss of psi starts at the trial stress, which the body never had: it flowed at the yield stress
-        (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
+        (vm, pressure, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
+        start, end = (
+            self._yielding(plastic.flow_stress(alpha, points), pressure)
+            for alpha in (block.alpha, plastic.accumulated_strain[points])
+        )
+        gain = end - start
         over = block.J * (vm_trial - vm) + gain
         if self._excess is not None:
             over -= np.minimum(self._excess[points], over)
