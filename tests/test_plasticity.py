@@ -267,7 +267,7 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
 
 @pytest.mark.parametrize("energy", FINITE)
 def test_flow_at_a_pressure_beyond_yield_dissipates_nothing(energy: str) -> None:
-    """Frobenius norm: the pressure alone exceeds Y, so that no deviator is left, and what flows carries no shear stress.
+    """Frobenius norm: the pressure alone exceeds Y, so that what flows carries no shear stress.
 
     A step dissipated -K alpha^2 / 2 J/m^3 before, alpha its flow.
     """
