@@ -72,13 +72,14 @@ def traction_work(traction: Expr, w: Expr, ds: ufl.Measure) -> Form:
     return ufl.inner(traction, w) * ds
 
 
-def pressure_work(pressure: Expr, u: Expr, w: Expr, normal: Expr, ds: ufl.Measure, *, linear: bool) -> Form:
+def pressure_work(pressure: Expr, u: Expr, w: Expr, normal: Expr, ds: ufl.Measure, energy: Energy) -> Form:
     """Return the virtual work of a pressure that follows the surface, -int p J F^-T N . w dA.
 
-    p is in Pa, positive in compression. `linear`: on the reference surface, for the linear energy.
+    p is in Pa, positive in compression. J has the stretch of the thickness in plane stress. A pressure on a body with
+    the linear energy acts on the reference surface.
     """
-    if linear:
+    if energy.linear:
         return -pressure * ufl.inner(normal, w) * ds
     F = deformation_gradient(u)
-    cofactor = ufl.det(F) * ufl.inv(F).T
+    cofactor = energy.thickness_stretch(F) * ufl.det(F) * ufl.inv(F).T
     return -pressure * ufl.inner(cofactor * normal, w) * ds

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from fracsim.forms.energies import ENERGIES
 from fracsim.scene import Scene
@@ -187,6 +188,32 @@ def test_pressure_on_a_closed_body_is_in_balance(energy: str) -> None:
     relative = 0.0 if energy == "linear" else 20 * strain  # second-order terms of the nonlinear law
     np.testing.assert_allclose(u, -strain * X, atol=(1e-9 + relative) * strain)
     np.testing.assert_allclose(scene.balance.reactions[scene.balance.motion.owned_dofs], 0, atol=1e-7 * p)
+
+
+def test_a_pressure_acts_on_the_thickness_that_a_stretched_sheet_has() -> None:
+    """Suction 0.2 Y on an end in plane stress: S = Y E_11, and Cauchy's stress l_1 S / (l_2 l_3) is the suction.
+
+    Across, l^2 = 1 - 2 nu E_11 in both directions.
+    """
+    suction = 0.2 * YOUNG
+
+    def excess(strain: float) -> float:
+        return float(np.sqrt(1 + 2 * strain) * strain / (1 - 2 * POISSON * strain) - suction / YOUNG)
+
+    expected = np.sqrt(1 + 2 * brentq(excess, 0.0, 1.0))
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25},
+        material={"energy": "stvk", "plane": "stress", "young": YOUNG, "poisson": POISSON, "density": DENSITY},
+        boundary=[
+            {"on": "left", "fix": "x"},
+            {"on": {"box": [[-1e-9, -1e-9], [1e-9, 1e-9]]}, "fix": "y"},
+            {"on": "right", "pressure": -suction},
+        ],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )
+    march(scene, state)
+    X, u = positions(scene), state.u.reshape(-1, 2)
+    np.testing.assert_allclose(u[:, 0], (expected - 1) * X[:, 0], atol=1e-6)
 
 
 def test_tractions_on_two_groups() -> None:

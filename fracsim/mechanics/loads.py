@@ -12,6 +12,7 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..forms.balance import pressure_work, traction_work
+from ..forms.energies import Energy
 from ..mesh.dolfinx_compat import exterior_facet_domain
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import sum_over_ranks
@@ -132,17 +133,18 @@ class Pressure(Term):
 
     name = "pressure"
 
-    def __init__(self, assembler: VectorAssembler, u: fem.Function, parts: Sequence[OnFacets], *, linear: bool) -> None:
+    def __init__(self, assembler: VectorAssembler, u: fem.Function, parts: Sequence[OnFacets], energy: Energy) -> None:
         """Compile the form of the pressures (collective).
 
         Args:
             assembler: of vectors over the dofs.
             u: displacement.
             parts: facets, and pressures in Pa.
-            linear: whether pressures act on the reference surface.
+            energy: elastic energy of the body.
         """
         domain = assembler.domain
-        self._assembler, self._u, self.symmetric, self.linear = assembler, u, linear, linear
+        self._assembler, self._u, self._energy = assembler, u, energy
+        self.symmetric = self.linear = energy.linear
         self._constants = _TimeDependentConstants(domain)
         measures = surface_measures(domain, [facets for facets, _ in parts])
         self._pressures = [
@@ -152,8 +154,7 @@ class Pressure(Term):
         self._form = compile_form(self._work(ufl.TestFunction(domain.space)))
 
     def _work(self, w: Expr) -> ufl.Form:
-        linear = self.symmetric
-        return -sum(pressure_work(p, self._u, w, self._normal, ds, linear=linear) for p, ds in self._pressures)
+        return -sum(pressure_work(p, self._u, w, self._normal, ds, self._energy) for p, ds in self._pressures)
 
     def begin_step(self, level: TimeLevel) -> None:
         """Evaluate the pressures at the time level."""

@@ -145,8 +145,8 @@ def _viscosity(inputs: TermInputs) -> list[Term]:
 
 def _pressure(inputs: TermInputs) -> list[Term]:
     pressures = inputs.on_facets("pressure")
-    linear = inputs.stress.material.energy.linear
-    return [Pressure(inputs.assembler, inputs.u, pressures, linear=linear)] if pressures else []
+    energy = inputs.stress.material.energy
+    return [Pressure(inputs.assembler, inputs.u, pressures, energy)] if pressures else []
 
 
 def _dead_loads(inputs: TermInputs) -> list[Term]:
