@@ -182,8 +182,7 @@ class ObstacleTerm(ContactState, Term):
         for index, (posed, q) in moving.items():
             # gaps of the current forces are those at the current poses
             min_gap = self.obstacle_forces()[index].min_gap if is_current else 0.0
-            limits = self.facets_for(index), self.point_candidates, min_gap
-            fractions.append(safe_motion_fractions(posed, x, motion, q, *limits))
+            fractions.append(safe_motion_fractions(posed, x, motion, q, self.facets_for(index), min_gap))
         return self.surface.min_fraction(np.min(fractions, axis=0))
 
     def patch(self, nodes: Ints) -> ObstaclePatch:
