@@ -19,6 +19,7 @@ Equations: docs/theory.md#barrier, docs/theory.md#friction.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,14 +40,7 @@ from .pair_search import (
     intersecting_pairs,
     pair_distances,
 )
-from .sample_points import (
-    Centroids,
-    IpcFriction,
-    Vertices,
-    gradient_at_points,
-    hessian_at_points,
-    projection,
-)
+from .sample_points import IpcFriction, SamplePoints, gradient_at_points, hessian_at_points, projection
 
 
 @dataclass(frozen=True)
@@ -112,7 +106,7 @@ class PairShare:
 class OwnPairs:
     """Pairs of this rank among the pairs of sample points, edges and triangles."""
 
-    def __init__(self, samples: Vertices | Centroids, vertices: Flags) -> None:
+    def __init__(self, samples: SamplePoints, vertices: Flags) -> None:
         """`vertices`: (n,) flags of those of this rank."""
         mesh, low = samples.mesh, samples.lowest_vertices
         faces = np.asarray(mesh.faces).reshape(-1, 3)
@@ -135,98 +129,49 @@ class PairKind:
     Attributes:
         simplices: pairs that are searched, and the distance at which the barrier begins.
         stiffness: Pa.
-        samples: sample points.
-        vertices: (n,) flags of the vertices of this rank; None: all pairs are its own.
     """
 
     simplices: SimplexPairs
     stiffness: float
-    samples: Vertices | Centroids
-    vertices: Flags | None = None
-
-    @property
-    def distance(self) -> float:
-        """Distance at which the barrier begins, m."""
-        return self.simplices.distance
 
     @cached_property
     def barrier(self) -> ipctk.BarrierPotential:
         """Barrier of ipctk."""
-        return ipctk.BarrierPotential(self.distance, self.stiffness, True)
-
-    @cached_property
-    def own_pairs(self) -> OwnPairs | None:
-        """Pairs of this rank; None: all pairs are its own."""
-        return None if self.vertices is None else OwnPairs(self.samples, self.vertices)
+        return ipctk.BarrierPotential(self.simplices.distance, self.stiffness, True)
 
     def candidates(self, pairs: Ints, x: Values) -> ipctk.Candidates:
         """Candidates of ipctk among pairs (k, 2) of simplices with vertices at x (n, d), m.
 
         ipctk finds the pairs on which the barrier acts among those within its distance alone.
         """
-        limit = (1.0 + PAIRS.distance_tolerance) * self.distance
+        limit = (1.0 + PAIRS.distance_tolerance) * self.simplices.distance
         pairs = pairs[pair_distances(self.simplices, pairs, x) < limit]
-        before = self.samples.mesh.num_vertices - len(self.simplices.first) if self.simplices.centroids else 0
+        # centroids are the sample points behind the vertices
+        before = len(x) if self.simplices.centroids else 0
         columns, result = (before + pairs[:, 0], pairs[:, 1]), ipctk.Candidates()
         first, second = (list[int](column) for column in columns)
         if self.simplices.is_one_set:
             result.ee_candidates = list(map(ipctk.EdgeEdgeCandidate, first, second))
-            return result
-        if self.simplices.second.shape[1] == 3:
+        elif self.simplices.second.shape[1] == 3:
             result.fv_candidates = list(map(ipctk.FaceVertexCandidate, second, first))
         else:
             result.ev_candidates = list(map(ipctk.EdgeVertexCandidate, second, first))
         return result
 
-    def active_pairs(self, near: Ints, x: Values) -> ActivePairs:
-        """Pairs on which the barrier acts among near ones (k, 2), with vertices at x (n, d), m."""
-        pairs = ipctk.NormalCollisions()
-        pairs.use_area_weighting = True
-        pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
-        positions = self.samples.positions(x)
-        pairs.build(self.candidates(near, x), self.samples.mesh, positions, self.distance)
-        if self.own_pairs is not None:
-            self.own_pairs.select(pairs)
-        self.samples.weight(pairs)
-        return ActivePairs(self, pairs, positions)
-
 
 @dataclass(frozen=True)
 class ActivePairs:
-    """Pairs on which the barrier of a kind acts.
+    """Pairs on which barriers act.
 
     Attributes:
-        kind: kind of pairs.
-        pairs: ipctk's pairs.
+        vertices: (n, d) m.
         positions: (p, d) sample points, m.
+        of_kinds: each kind with any, and ipctk's pairs.
     """
 
-    kind: PairKind
-    pairs: ipctk.NormalCollisions
+    vertices: Values
     positions: Values
-
-    def energy(self) -> float:
-        """Energy of the barrier, J."""
-        return float(self.kind.barrier(self.pairs, self.kind.samples.mesh, self.positions))
-
-    def gradient(self) -> Values:
-        """(n d,) derivatives of the energy by the vertices, N."""
-        samples = self.kind.samples
-        return samples.gradient(self.kind.barrier.gradient(self.pairs, samples.mesh, self.positions))
-
-    def hessian(self, projection: ipctk.PSDProjectionMethod) -> csr_matrix:
-        """(n d, n d) second derivatives of the energy by the vertices, N/m."""
-        samples = self.kind.samples
-        return samples.hessian(self.kind.barrier.hessian(self.pairs, samples.mesh, self.positions, projection))
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is no pair."""
-        return len(self.pairs) == 0
-
-    def least_squared_distance(self) -> float:
-        """Least squared distance of a pair, m^2."""
-        return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
+    of_kinds: Sequence[tuple[PairKind, ipctk.NormalCollisions]]
 
 
 # --- collision mesh ---
@@ -274,7 +219,7 @@ class IpcPairs:
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
         self._mesh = collision_mesh(rest_positions, elements)
-        mesh, at_vertices, centroids = self._mesh, Vertices(self._mesh), Centroids(self._mesh)
+        mesh, self._samples = self._mesh, SamplePoints(self._mesh)
         points, surface_edges = np.arange(mesh.num_vertices)[:, None], np.ascontiguousarray(mesh.edges, np.int32)
         surface = np.ascontiguousarray(mesh.faces, np.int32) if is_3d else surface_edges
         sets = [
@@ -299,11 +244,9 @@ class IpcPairs:
             mesh.can_collide = of_patches if vertices is None else of_patches & mesh.can_collide
         where = PairFilter.of(mesh.num_vertices, patch, vertices)
         self._search = PairSearch(where, sets, PAIRS.search_margin * distance)
-        self._kinds = [
-            PairKind(pairs, weight * stiffness, centroids if pairs.centroids else at_vertices, vertices)
-            for pairs, weight in zip(sets, self._weights, strict=True)
-        ]
-        self._clear_active()
+        self._kinds = [PairKind(pairs, weight * stiffness) for pairs, weight in zip(sets, self._weights, strict=True)]
+        self._own_pairs = None if vertices is None else OwnPairs(self._samples, vertices)
+        self._active: ActivePairs | None = None  # of the last vertices
         X = self._mesh.rest_positions
         edge = float(ipctk.mean_edge_length(X, X, self._mesh.edges)[0]) if edge is None else edge
         self._edges = np.broadcast_to(edge, len(rest_positions))[used]
@@ -317,54 +260,69 @@ class IpcPairs:
 
     # --- candidates and active pairs ---
 
-    def _clear_active(self) -> None:
-        """Discard the pairs on which barriers act."""
-        self._active: list[ActivePairs] = []
-        self._active_positions: Values = np.empty(0)
-
-    def _active_pairs(self, vertices: Values) -> list[ActivePairs]:
-        """Pairs on which barriers act, of each kind with any; those of the last positions are kept."""
-        if not np.array_equal(vertices, self._active_positions):
+    def _active_pairs(self, vertices: Values) -> ActivePairs:
+        """Pairs on which barriers act; those of the last positions are kept."""
+        if self._active is None or not np.array_equal(vertices, self._active.vertices):
             items = zip(self._kinds, self._search.pairs(vertices), strict=True)
-            active = [kind.active_pairs(near, vertices) for kind, near in items if len(near)]
-            self._active = [pairs for pairs in active if not pairs.is_empty]
-            self._active_positions = vertices.copy()
+            near = [(kind, pairs) for kind, pairs in items if len(pairs)]
+            # sample points are placed only where pairs are near
+            positions = self._samples.positions(vertices) if near else vertices
+            active = [(kind, self._pairs_in_contact(kind, pairs, vertices, positions)) for kind, pairs in near]
+            self._active = ActivePairs(vertices.copy(), positions, [entry for entry in active if len(entry[1])])
         return self._active
+
+    def _pairs_in_contact(
+        self, kind: PairKind, near: Ints, vertices: Values, positions: Values
+    ) -> ipctk.NormalCollisions:
+        """Pairs on which the barrier of a kind acts among near ones (k, 2), with sample points at `positions`, m."""
+        pairs, simplices = ipctk.NormalCollisions(), kind.simplices
+        pairs.use_area_weighting = True
+        pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
+        pairs.build(kind.candidates(near, vertices), self._samples.mesh, positions, simplices.distance)
+        if self._own_pairs is not None:
+            self._own_pairs.select(pairs)
+        if simplices.centroids:
+            self._samples.weight_centroids(pairs)
+        return pairs
 
     # --- barrier ---
 
     def energy(self, x: Values) -> float:
         """Energy E(x) of this rank's pairs, J."""
-        return sum((pairs.energy() for pairs in self._active_pairs(x[self._points])), 0.0)
+        active, samples = self._active_pairs(x[self._points]), self._samples
+        energies = (kind.barrier(pairs, samples.mesh, active.positions) for kind, pairs in active.of_kinds)
+        return sum(map(float, energies), 0.0)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
-        vertices = x[self._points]
-        total = sum((pairs.gradient() for pairs in self._active_pairs(vertices)), np.zeros(vertices.size))
-        return gradient_at_points(total, self._points, x.shape)
+        active, samples = self._active_pairs(x[self._points]), self._samples
+        gradients = [kind.barrier.gradient(pairs, samples.mesh, active.positions) for kind, pairs in active.of_kinds]
+        return gradient_at_points(samples.gradient(gradients), self._points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
-        vertices, method = x[self._points], projection(exact=exact)
-        none = csr_matrix((vertices.size, vertices.size))
-        total = sum((pairs.hessian(method) for pairs in self._active_pairs(vertices)), none)
-        return hessian_at_points(total, self._points, x.shape)
+        active, samples, method = self._active_pairs(x[self._points]), self._samples, projection(exact=exact)
+        hessians = [
+            kind.barrier.hessian(pairs, samples.mesh, active.positions, method) for kind, pairs in active.of_kinds
+        ]
+        return hessian_at_points(samples.hessian(hessians), self._points, x.shape)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""
         items = zip(self._kinds, self._weights, strict=True)
         self._kinds = [replace(kind, stiffness=weight * stiffness) for kind, weight in items]
-        self._clear_active()
+        self._active = None
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
         self._search.clear_caches()
-        self._clear_active()
+        self._active = None
 
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
-        active = self._active_pairs(x[self._points])
-        return float(np.sqrt(min((pairs.least_squared_distance() for pairs in active), default=np.inf)))
+        active, samples = self._active_pairs(x[self._points]), self._samples
+        squares = (pairs.compute_minimum_distance(samples.mesh, active.positions) for _, pairs in active.of_kinds)
+        return float(np.sqrt(min(squares, default=np.inf)))
 
     # --- friction ---
 
@@ -376,13 +334,12 @@ class IpcPairs:
             start: (n, d) positions from which slip is measured, m.
             slip: from which on friction has its full size, m: a speed times the time step.
         """
-        vertices = x[self._points]
-        parts = []
-        for pairs in self._active_pairs(vertices):
+        active, parts = self._active_pairs(x[self._points]), []
+        for kind, pairs in active.of_kinds:
             part = ipctk.TangentialCollisions()
-            part.build(pairs.kind.samples.mesh, pairs.positions, pairs.pairs, pairs.kind.barrier, self._friction)
-            parts.append((pairs.kind.samples, part))
-        return IpcFriction(self._points, parts, start[self._points], ipctk.FrictionPotential(slip))
+            part.build(self._samples.mesh, active.positions, pairs, kind.barrier, self._friction)
+            parts.append(part)
+        return IpcFriction(self._points, self._samples, parts, start[self._points], ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 

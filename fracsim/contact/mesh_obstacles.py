@@ -294,7 +294,8 @@ class BarrierPart(SurfacePart[IpcPairs]):
         """
         if not self.friction or self.is_far(x):
             return None
-        return self.pairs.lag_friction(points := self.points(x), points, slip)
+        friction = self.pairs.lag_friction(points := self.points(x), points, slip)
+        return friction if friction.parts else None
 
     def free_fraction(self, x: Values, end: Values, start_pose: Pose | None = None) -> float:
         """Fraction of the straight motion from x to `end` (n, d) without a collision (collective).

@@ -1,4 +1,4 @@
-"""Sample points of the barrier between the elements of a surface, vertices or centroids, and friction at them.
+"""Sample points of the barrier between the elements of a surface, vertices and centroids, and friction at them.
 
 With one point at the centroid of an element, weighted with the element's measure, the barrier between two parallel
 faces presses along their normal as long as no centroid overhangs. Points on the rim press outwards as soon as aligned
@@ -10,6 +10,7 @@ Equations: docs/theory.md#barrier, docs/theory.md#friction.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,41 +23,10 @@ from ..array_types import Ints, Values
 from .shape_base import measures
 
 
-@dataclass(frozen=True)
-class Vertices:
-    """Vertices of a surface, weighted by ipctk with their shares of the elements around them.
+class SamplePoints:
+    """Vertices of a surface, n, and after them the m centroids of its elements.
 
-    Attributes:
-        mesh: the surface.
-    """
-
-    mesh: ipctk.CollisionMesh
-
-    @property
-    def lowest_vertices(self) -> Ints:
-        """(p,) lowest vertex of which each sample point consists: itself."""
-        return np.arange(self.mesh.num_vertices)
-
-    def positions(self, x: Values) -> Values:
-        """(p, d) sample points with the vertices at x (n, d), m."""
-        return x
-
-    def gradient(self, at_samples: Values) -> Values:
-        """(n d,) derivatives by the vertices of derivatives (p d,) by the sample points."""
-        return at_samples
-
-    def hessian(self, at_samples: csr_matrix) -> csr_matrix:
-        """(n d, n d) second derivatives by the vertices of those (p d, p d) by the sample points."""
-        return at_samples
-
-    def weight(self, pairs: ipctk.NormalCollisions) -> None:
-        """Do nothing: ipctk has set the weights of pairs."""
-
-
-class Centroids:
-    """Centroids of the elements of a surface, each weighted with the measure of its element.
-
-    The sample points are the n vertices, which the elements need, and after them the m centroids.
+    ipctk weights vertices with their shares of the elements around them, and centroids, points of no element, with 1.
 
     Attributes:
         elements: (m, d) vertices of segments or triangles.
@@ -106,16 +76,20 @@ class Centroids:
         """(n + m, d) sample points with the vertices at x (n, d), m."""
         return np.asarray(self._map @ x)
 
-    def gradient(self, at_samples: Values) -> Values:
-        """(n d,) derivatives by the vertices of derivatives ((n + m) d,) by the sample points."""
-        return np.asarray(self._map_of_dofs.T @ at_samples)
+    def gradient(self, at_samples: Sequence[Values]) -> Values:
+        """(n d,) derivatives by the vertices of the sum of derivatives ((n + m) d,) by the sample points."""
+        if not at_samples:
+            return np.zeros(self._count * self._surface.dim)
+        return np.asarray(self._map_of_dofs.T @ sum(at_samples[1:], at_samples[0]))
 
-    def hessian(self, at_samples: csr_matrix) -> csr_matrix:
-        """(n d, n d) second derivatives by the vertices of those by the sample points."""
-        return (self._map_of_dofs.T @ at_samples @ self._map_of_dofs).tocsr()
+    def hessian(self, at_samples: Sequence[csr_matrix]) -> csr_matrix:
+        """(n d, n d) second derivatives by the vertices of the sum of those by the sample points."""
+        if not at_samples:
+            return csr_matrix((self._count * self._surface.dim,) * 2)
+        return (self._map_of_dofs.T @ sum(at_samples[1:], at_samples[0]) @ self._map_of_dofs).tocsr()
 
-    def weight(self, pairs: ipctk.NormalCollisions) -> None:
-        """Multiply the weights of pairs by the measures of elements: ipctk gives points of no element the measure 1."""
+    def weight_centroids(self, pairs: ipctk.NormalCollisions) -> None:
+        """Multiply the weights of pairs of centroids by the measures of their elements."""
         measure = self._weights
         for pair in (*pairs.fv_collisions, *pairs.ev_collisions):
             pair.weight *= measure[pair.vertex_id]
@@ -140,45 +114,38 @@ class IpcFriction:
 
     Attributes:
         points: (k,) numbers of the vertices of the surface among the points.
-        parts: sample points and pairs of each kind.
+        samples: sample points.
+        parts: pairs of each kind.
         start: (n, d) x_0, m.
         potential: of ipctk.
     """
 
     points: Ints
-    parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
+    samples: SamplePoints
+    parts: list[ipctk.TangentialCollisions]
     start: Values
     potential: ipctk.FrictionPotential
 
     def energy(self, x: Values) -> float:
         """E(x), J: not stored, but the work of friction where the slip is longer than e."""
-        motion = self._motion(x)
-        return float(
-            sum(self.potential(pairs, samples.mesh, samples.positions(motion)) for samples, pairs in self.parts)
-        )
+        mesh, motion = self.samples.mesh, self._motion(x)
+        return sum((float(self.potential(pairs, mesh, motion)) for pairs in self.parts), 0.0)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: minus the forces on the points."""
-        motion = self._motion(x)
-        of_parts = (
-            samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
-            for samples, pairs in self.parts
-        )
-        return gradient_at_points(sum(of_parts, np.zeros(motion.size)), self.points, x.shape)
+        mesh, motion = self.samples.mesh, self._motion(x)
+        of_parts = [self.potential.gradient(pairs, mesh, motion) for pairs in self.parts]
+        return gradient_at_points(self.samples.gradient(of_parts), self.points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
-        motion, method = self._motion(x), projection(exact=exact)
-        of_parts = (
-            samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
-            for samples, pairs in self.parts
-        )
-        total = sum(of_parts, csr_matrix((motion.size, motion.size)))
-        return hessian_at_points(total, self.points, x.shape)
+        mesh, motion, method = self.samples.mesh, self._motion(x), projection(exact=exact)
+        of_parts = [self.potential.hessian(pairs, mesh, motion, method) for pairs in self.parts]
+        return hessian_at_points(self.samples.hessian(of_parts), self.points, x.shape)
 
     def _motion(self, x: Values) -> Values:
-        motion: Values = x[self.points] - self.start
-        return motion
+        """Motion of the sample points, m."""
+        return self.samples.positions(x[self.points] - self.start)
 
 
 def gradient_at_points(gradient: npt.ArrayLike, points: Ints, shape: tuple[int, ...]) -> Values:
