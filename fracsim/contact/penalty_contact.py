@@ -94,9 +94,11 @@ class PenaltyContact(Term):
         if self._positions is None:
             self._positions = self.surface.positions(self._u.x.array[: self._owned])
             self.state.settle()
-            # those at the start of the step, with the elements of its end
+            # those at the start of the step, with the elements of its end, for springs of friction
             surface, u = self.surface, self._start_u
-            self._start = None if u is None else surface.current.point_map(surface.nodal_values(u))
+            self._start: Values | None = None
+            if u is not None and any(part.friction for part in self._parts):
+                self._start = surface.current.point_map(surface.nodal_values(u))
         return self._positions
 
     def _start_poses(self) -> Sequence[Pose | None]:
@@ -112,8 +114,10 @@ class PenaltyContact(Term):
 
     def _evaluate(self, part: PenaltyPart, x: Values, start_pose: Pose | None) -> PenaltyForces:
         """Forces of a part with the body at x (n, d), m; friction begins at the start of the step, if one began."""
-        start = None if self._start is None or not part.friction else part.points(self._start, start_pose)
-        return part.pairs.forces(part.points(x), start, part.friction)
+        points, start = part.points(x), None
+        if self._start is not None and part.friction and len(part.pairs.contacts(points).gap):
+            start = part.points(self._start, start_pose)
+        return part.pairs.forces(points, start, part.friction)
 
     def min_gap(self) -> float:
         """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
