@@ -13,14 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import pairwise, product
+from itertools import product
 
 import numpy as np
 from mpi4py import MPI
 from scipy.sparse import csr_matrix, vstack
 
 from ..array_types import Flags, Ints, Values
-from ..mesh.parallel import allgather, alltoall, sum_over_ranks
+from ..mesh.parallel import allgather, alltoall
 from ..mesh.split_surface.local_surface import restrict_to_used_columns
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.topology import row_keys
@@ -237,14 +237,14 @@ def bounding_boxes(corners: Values) -> Values:
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
 
 
-# --- path of displacements for which elements were exchanged ---
+# --- displacements for which elements were exchanged ---
 
 
 @dataclass(frozen=True)
 class ExchangePath:
-    """Path of displacements for which elements were exchanged; it serves all positions near its straight parts.
+    """Displacements for which elements were exchanged; they serve all positions near one of them.
 
-    Any two points have come nearer than on it by at most the diagonal of the bounding box of the motions of all points.
+    Any two points have come nearer than there by at most the diagonal of the bounding box of the motions of all points.
 
     Attributes:
         comm: ranks.
@@ -258,36 +258,12 @@ class ExchangePath:
 
     def serves(self, positions: Sequence[list[Values]]) -> bool:
         """Whether no element can be missing at positions as of `stops` (collective)."""
-        # mostly all are near points of the path, and one message tells it
-        from_points = [[_differences(x, stop) for stop in self.stops] for x in positions]
-        if self._is_within(motion_diagonals(self.comm, from_points)):
-            return True
-        motions = list(pairwise(self.stops))
-        from_motions = [[_away_from_motion(self.comm, x, *ends) for ends in motions] for x in positions]
-        return bool(motions) and self._is_within(motion_diagonals(self.comm, from_motions))
-
-    def _is_within(self, diagonals: Values) -> bool:
-        """Whether one diagonal of each row is within the margin; positions that are no numbers have no elements."""
-        distances = diagonals.min(axis=1)
+        motions = [
+            [[end - begin for end, begin in zip(x, stop, strict=True)] for stop in self.stops] for x in positions
+        ]
+        distances = motion_diagonals(self.comm, motions).min(axis=1)
+        # positions that are no numbers have no elements
         return not np.any((distances > self.margin) & np.isfinite(distances))
-
-
-def _differences(x: Sequence[Values], start: Sequence[Values]) -> list[Values]:
-    return [end - begin for end, begin in zip(x, start, strict=True)]
-
-
-def _away_from_motion(comm: MPI.Intracomm, x: list[Values], start: list[Values], stop: list[Values]) -> list[Values]:
-    """Differences of positions (n, d) from those at one time of a straight motion, which is fitted, m (collective)."""
-    offset, change, d = _differences(x, start), _differences(stop, start), x[0].shape[1]
-    o, c = (np.concatenate(vectors) for vectors in (offset, change))
-    count, square, product, *sums = sum_over_ranks(
-        comm, np.array([len(c), np.vdot(c, c), np.vdot(o, c), *c.sum(axis=0), *o.sum(axis=0)])
-    )
-    # all may have moved alike besides
-    mean_change, mean_offset = np.array(sums[:d]) / count, np.array(sums[d:]) / count
-    square, product = square - count * (mean_change @ mean_change), product - count * (mean_offset @ mean_change)
-    along = min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
-    return [of_points - along * motion for of_points, motion in zip(offset, change, strict=True)]
 
 
 def motion_diagonals(comm: MPI.Intracomm, motions: Sequence[Sequence[Sequence[Values]]]) -> Values:

@@ -1,8 +1,8 @@
 """Surface of a body in contact, distributed over the ranks: no rank has all of it.
 
-Each rank has the elements of its own cells and those of others that may come near them. These are exchanged for a path
-of displacements: for all positions within a margin of its straight parts. Beyond it they are exchanged again: any two
-points have come nearer by at most the diagonal of the bounding box of the motions of all points.
+Each rank has the elements of its own cells and those of others that may come near them. These are exchanged for some
+displacements: for all positions within a margin of one of them. Beyond it they are exchanged again: any two points have
+come nearer by at most the diagonal of the bounding box of the motions of all points.
 
 Equations: docs/theory.md#contact, docs/theory.md#explicit-contact.
 """
