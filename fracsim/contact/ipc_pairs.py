@@ -40,7 +40,7 @@ from .pair_search import (
     intersecting_pairs,
     pair_distances,
 )
-from .sample_points import IpcFriction, SamplePoints, gradient_at_points, hessian_at_points, projection
+from .sample_points import IpcFriction, SamplePoints, projection
 
 
 @dataclass(frozen=True)
@@ -219,7 +219,7 @@ class IpcPairs:
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
         self._mesh = collision_mesh(rest_positions, elements)
-        mesh, self._samples = self._mesh, SamplePoints(self._mesh)
+        mesh = self._mesh
         points, surface_edges = np.arange(mesh.num_vertices)[:, None], np.ascontiguousarray(mesh.edges, np.int32)
         surface = np.ascontiguousarray(mesh.faces, np.int32) if is_3d else surface_edges
         sets = [
@@ -233,6 +233,7 @@ class IpcPairs:
         self.comm = MPI.COMM_SELF if share is None else share.comm
         # numbers of the vertices of ipctk's surface among the points, ascending
         self._points = used = np.unique(elements)
+        self._samples = SamplePoints(mesh, used, len(rest_positions))
         vertices = None if share is None or share.comm.size == 1 else share.points[used]
         if vertices is not None:
             # two points of other ranks have the same number and do not touch
@@ -260,13 +261,14 @@ class IpcPairs:
 
     # --- candidates and active pairs ---
 
-    def _active_pairs(self, vertices: Values) -> ActivePairs:
+    def _active_pairs(self, x: Values) -> ActivePairs:
         """Pairs on which barriers act; those of the last positions are kept."""
+        vertices = x[self._points]
         if self._active is None or not np.array_equal(vertices, self._active.vertices):
             items = zip(self._kinds, self._search.pairs(vertices), strict=True)
             near = [(kind, pairs) for kind, pairs in items if len(pairs)]
             # sample points are placed only where pairs are near
-            positions = self._samples.positions(vertices) if near else vertices
+            positions = self._samples.positions(x) if near else vertices
             active = [(kind, self._pairs_in_contact(kind, pairs, vertices, positions)) for kind, pairs in near]
             self._active = ActivePairs(vertices.copy(), positions, [entry for entry in active if len(entry[1])])
         return self._active
@@ -289,23 +291,23 @@ class IpcPairs:
 
     def energy(self, x: Values) -> float:
         """Energy E(x) of this rank's pairs, J."""
-        active, samples = self._active_pairs(x[self._points]), self._samples
+        active, samples = self._active_pairs(x), self._samples
         energies = (kind.barrier(pairs, samples.mesh, active.positions) for kind, pairs in active.of_kinds)
         return sum(map(float, energies), 0.0)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
-        active, samples = self._active_pairs(x[self._points]), self._samples
+        active, samples = self._active_pairs(x), self._samples
         gradients = [kind.barrier.gradient(pairs, samples.mesh, active.positions) for kind, pairs in active.of_kinds]
-        return gradient_at_points(samples.gradient(gradients), self._points, x.shape)
+        return samples.gradient(gradients)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
-        active, samples, method = self._active_pairs(x[self._points]), self._samples, projection(exact=exact)
+        active, samples, method = self._active_pairs(x), self._samples, projection(exact=exact)
         hessians = [
             kind.barrier.hessian(pairs, samples.mesh, active.positions, method) for kind, pairs in active.of_kinds
         ]
-        return hessian_at_points(samples.hessian(hessians), self._points, x.shape)
+        return samples.hessian(hessians)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""
@@ -320,7 +322,7 @@ class IpcPairs:
 
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
-        active, samples = self._active_pairs(x[self._points]), self._samples
+        active, samples = self._active_pairs(x), self._samples
         squares = (pairs.compute_minimum_distance(samples.mesh, active.positions) for _, pairs in active.of_kinds)
         return float(np.sqrt(min(squares, default=np.inf)))
 
@@ -334,12 +336,12 @@ class IpcPairs:
             start: (n, d) positions from which slip is measured, m.
             slip: from which on friction has its full size, m: a speed times the time step.
         """
-        active, parts = self._active_pairs(x[self._points]), []
+        active, parts = self._active_pairs(x), []
         for kind, pairs in active.of_kinds:
             part = ipctk.TangentialCollisions()
             part.build(self._samples.mesh, active.positions, pairs, kind.barrier, self._friction)
             parts.append(part)
-        return IpcFriction(self._points, self._samples, parts, start[self._points], ipctk.FrictionPotential(slip))
+        return IpcFriction(self._samples, parts, start, ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 

@@ -254,7 +254,6 @@ class ObstacleTerm(ContactState, Term):
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
-        self.surface.clear_search()
         self._shown.discard()
         self.discard_forces()
 

@@ -16,8 +16,7 @@ from functools import cached_property
 
 import ipctk
 import numpy as np
-import numpy.typing as npt
-from scipy.sparse import csr_matrix, identity, kron, vstack
+from scipy.sparse import csr_matrix, kron
 
 from ..array_types import Ints, Values
 from .shape_base import measures
@@ -32,24 +31,24 @@ class SamplePoints:
         elements: (m, d) vertices of segments or triangles.
     """
 
-    def __init__(self, surface: ipctk.CollisionMesh) -> None:
-        self._surface = surface
+    def __init__(self, surface: ipctk.CollisionMesh, points: Ints, count: int) -> None:
+        """Sample points of a surface with the vertices `points` (n,) among N = `count` points."""
+        self._surface, self._points, self._point_count = surface, points, count
         self.elements: Ints = np.asarray(surface.faces if surface.dim == 3 else surface.edges, np.int64)
         self._count = surface.num_vertices
 
-    @cached_property
-    def _incidence(self) -> csr_matrix:
-        """(m, n) incidence: 1 for each vertex of an element."""
+    def _weights_of(self, columns: Ints, count: int) -> csr_matrix:
+        """(n + m, count) weights of the vertices, which have these columns (n,), in the sample points."""
         m, corners = self.elements.shape
-        return csr_matrix(
-            (np.ones(m * corners), self.elements.reshape(-1), np.arange(0, m * corners + 1, corners)),
-            shape=(m, self._count),
-        )  # fmt: skip
+        weights = np.concatenate([np.ones(self._count), np.full(m * corners, 1 / corners)])
+        starts = np.append(np.arange(self._count), self._count + np.arange(0, m * corners + 1, corners))
+        entries = np.append(columns, columns[self.elements])
+        return csr_matrix((weights, entries, starts), shape=(self._count + m, count))
 
     @cached_property
     def _map(self) -> csr_matrix:
-        """(n + m, n) weights of the vertices in the sample points."""
-        return vstack([identity(self._count), self._incidence / self.elements.shape[1]], format="csr")
+        """(n + m, N) weights of the points in the sample points."""
+        return self._weights_of(self._points, self._point_count)
 
     @cached_property
     def _map_of_dofs(self) -> csr_matrix:
@@ -58,7 +57,8 @@ class SamplePoints:
     @cached_property
     def mesh(self) -> ipctk.CollisionMesh:
         """Surface with the centroids as points of no element."""
-        rest_positions = np.asfortranarray(self._map @ self._surface.rest_positions)
+        of_vertices = self._weights_of(np.arange(self._count), self._count)
+        rest_positions = np.asfortranarray(of_vertices @ self._surface.rest_positions)
         faces = (self._surface.faces,) if self._surface.dim == 3 else ()
         return ipctk.CollisionMesh(rest_positions, self._surface.edges, *faces)
 
@@ -73,19 +73,20 @@ class SamplePoints:
         return np.append(np.zeros(self._count), measures(self._surface.rest_positions, self.elements))
 
     def positions(self, x: Values) -> Values:
-        """(n + m, d) sample points with the vertices at x (n, d), m."""
+        """(n + m, d) sample points with the points at x (N, d), m."""
         return np.asarray(self._map @ x)
 
     def gradient(self, at_samples: Sequence[Values]) -> Values:
-        """(n d,) derivatives by the vertices of the sum of derivatives ((n + m) d,) by the sample points."""
+        """(N, d) derivatives by the points of the sum of derivatives ((n + m) d,) by the sample points."""
+        shape = self._point_count, self._surface.dim
         if not at_samples:
-            return np.zeros(self._count * self._surface.dim)
-        return np.asarray(self._map_of_dofs.T @ sum(at_samples[1:], at_samples[0]))
+            return np.zeros(shape)
+        return np.asarray(self._map_of_dofs.T @ sum(at_samples[1:], at_samples[0])).reshape(shape)
 
     def hessian(self, at_samples: Sequence[csr_matrix]) -> csr_matrix:
-        """(n d, n d) second derivatives by the vertices of the sum of those by the sample points."""
+        """(N d, N d) second derivatives by the points of the sum of those by the sample points."""
         if not at_samples:
-            return csr_matrix((self._count * self._surface.dim,) * 2)
+            return csr_matrix((self._point_count * self._surface.dim,) * 2)
         return (self._map_of_dofs.T @ sum(at_samples[1:], at_samples[0]) @ self._map_of_dofs).tocsr()
 
     def weight_centroids(self, pairs: ipctk.NormalCollisions) -> None:
@@ -113,14 +114,12 @@ class IpcFriction:
     friction of a backward Euler step: against the slip, and at most mu N_k.
 
     Attributes:
-        points: (k,) numbers of the vertices of the surface among the points.
         samples: sample points.
         parts: pairs of each kind.
         start: (n, d) x_0, m.
         potential: of ipctk.
     """
 
-    points: Ints
     samples: SamplePoints
     parts: list[ipctk.TangentialCollisions]
     start: Values
@@ -135,35 +134,17 @@ class IpcFriction:
         """(n, d) dE/dx, N: minus the forces on the points."""
         mesh, motion = self.samples.mesh, self._motion(x)
         of_parts = [self.potential.gradient(pairs, mesh, motion) for pairs in self.parts]
-        return gradient_at_points(self.samples.gradient(of_parts), self.points, x.shape)
+        return self.samples.gradient(of_parts)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
         mesh, motion, method = self.samples.mesh, self._motion(x), projection(exact=exact)
         of_parts = [self.potential.hessian(pairs, mesh, motion, method) for pairs in self.parts]
-        return hessian_at_points(self.samples.hessian(of_parts), self.points, x.shape)
+        return self.samples.hessian(of_parts)
 
     def _motion(self, x: Values) -> Values:
         """Motion of the sample points, m."""
-        return self.samples.positions(x[self.points] - self.start)
-
-
-def gradient_at_points(gradient: npt.ArrayLike, points: Ints, shape: tuple[int, ...]) -> Values:
-    """(n, d) derivatives by all points of those (k d,) by `points` (k,); `shape`: (n, d)."""
-    result = np.zeros(shape)
-    result[points] = np.reshape(gradient, (len(points), shape[1]))
-    return result
-
-
-def hessian_at_points(H: csr_matrix, points: Ints, shape: tuple[int, ...]) -> csr_matrix:
-    """(n d, n d) second derivatives by all points of those (k d, k d) by `points` (k,), ascending; `shape`: (n, d)."""
-    n, d = shape
-    if not len(points):
-        return csr_matrix((n * d, n * d))
-    dofs = (d * points[:, None] + np.arange(d)).reshape(-1)
-    entries = np.zeros(n * d + 1, np.int64)
-    entries[1 + dofs] = np.diff(H.indptr)
-    return csr_matrix((H.data, dofs[H.indices], np.cumsum(entries)), shape=(n * d, n * d))
+        return self.samples.positions(x - self.start)
 
 
 def projection(*, exact: bool) -> ipctk.PSDProjectionMethod:
