@@ -20,6 +20,8 @@ from fracsim.contact.contact_surface import ContactSurface
 from fracsim.deformable_run import run_study
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.output.fracture_log import FractureLog
+from fracsim.output.frame_files import surface_output
+from fracsim.simulation import Simulation
 from fracsim.studies.evidence.precision.manufactured_solution import relative_errors, solve
 from fracsim.study.check import check_study
 from fracsim.study.mesh_source import build_mesh
@@ -357,3 +359,46 @@ def test_dust_is_what_has_one_corner() -> None:
     corners = len(scene.domain.input_mesh.points)
     assert breaks.counts[2] == corners
     assert breaks.count_single_nodes(scene.domain.volumes) == (corners, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_momentum_of_a_piece_is_the_impulse_of_its_floor(dim: int) -> None:
+    """A block bounces and vibrates: midside nodes have most of its mass and a velocity of their own."""
+    down = [0.0] * (dim - 1)
+    study = make_study(
+        mesh={"builder": "box", "size": [0.1] * dim, "h": 0.05, "order": 2},
+        material={"young": 1e6, "poisson": 0.3, "density": 1000.0},
+        initial={"velocity": [*down, -2.0]},
+        obstacle=[{"name": "floor", "shape": "plane", "at": [*down, -0.002], "normal": [*down, 1.0]}],
+        time={"scheme": "newmark", "step": 2e-4, "end": 0.01},
+    )
+    with Simulation(study) as simulation:
+        axis, before = "xyz"[dim - 1], simulation.fragments()
+        rows = []
+        while not simulation.ended:
+            rows.append(simulation.step())
+        after = simulation.fragments()
+    assert before["mass"] == pytest.approx(1000.0 * 0.1**dim)
+    assert before[f"velocity_{axis}"] == pytest.approx(-2.0)
+    impulse = -sum(row["dt"] * row[f"contact_floor_{axis}"] for row in rows)
+    gained = after["mass"] * (after[f"velocity_{axis}"] - before[f"velocity_{axis}"])
+    assert gained == pytest.approx(impulse, rel=1e-4)
+
+
+def test_midside_nodes_between_pieces_do_not_move_the_pieces() -> None:
+    """Two columns of nodes of a square torn off by hand: midside nodes of the broken edges are far away, pieces are
+    not."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25, "order": 2}, fracture={"strength": 1.0}
+    )
+    graph, x = scene.fracture.graph, scene.domain.nodes[:, 0]
+    ends = np.sort(x[graph.edge_nodes], axis=1)
+    graph.break_edges((ends[:, 0] < 0.6) & (ends[:, 1] > 0.6))
+    far = np.where(np.abs(x - 0.625) < 0.01, 10.0, 0.0)
+    state.u = state.v = np.stack([far, far], axis=1).ravel()
+    breaks = FractureLog(scene.balance.stress, scene.fracture)
+    output = surface_output(None, scene.balance, breaks, None, None, 1.0, smooth=False)
+    found = output.make_frame(state.state, []).fragments
+    assert found.mass == pytest.approx([0.625, 0.375])
+    assert found.centre[:, 0] == pytest.approx([0.3, 0.3125 / 0.375])
+    assert np.abs(found.velocity).max() == 0.0

@@ -104,6 +104,25 @@ class SurfaceFrame:
         )  # fmt: skip
 
 
+@dataclass(frozen=True)
+class MidsideMotion:
+    """Masses and motion of the midside nodes that this rank owns, with quadratic displacement.
+
+    Attributes:
+        ends: corners (m, 2) at the ends of their edges, nodes of the part.
+        mass: lumped masses (m,), kg.
+        x: present positions (m, d), m.
+        v: velocities (m, d), m/s.
+        corner_share: share of the lumped mass of linear displacement that corners have.
+    """
+
+    ends: Ints
+    mass: Values
+    x: Values
+    v: Values
+    corner_share: float
+
+
 class BodySurface:
     """Split surface of a mesh, or of the part of it that a rank has.
 
@@ -205,6 +224,7 @@ class BodySurface:
         broken_at: Values | None = None,
         fields: Iterable[Field] = (),
         corrections: Sequence[PointCorrection] = (),
+        midside: MidsideMotion | None = None,
     ) -> SurfaceFrame:
         """Surface at a time (collective).
 
@@ -218,6 +238,7 @@ class BodySurface:
             fields: further fields. Nodal ones are averaged over the parent nodes; an element has the value of the cell
                 behind it.
             corrections: corrections of the drawn points.
+            midside: midside nodes; None with linear displacement.
 
         Raises:
             NotConverged: a displacement or velocity is not finite in single precision; with fragment and cell.
@@ -229,12 +250,32 @@ class BodySurface:
         point_fields: Arrays = {"velocity": follow.mean(v)}
         point_fields |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
         cell_fields: dict[str, Any] = {field.name: field.values for field in fields if field.centre == "Cell"}
-        owned, add = self._is_owned, partial(total, self.part)
-        table = tabulate_fragments(
-            self.fragment_names, self.split.node_fragment[owned], self.mass[owned], self.volume,
-            (self.skeleton.points + u)[owned], v[owned], add,
-        )  # fmt: skip
+        table = self._tabulate_fragments(self.skeleton.points + u, v, midside)
         return self._frame(t, displacement, point_fields, cell_fields, table, broken_at)
+
+    def _tabulate_fragments(self, x: Values, v: Values, midside: MidsideMotion | None) -> FragmentTable:
+        """Mass and motion of the fragments (collective).
+
+        Each end of an edge has half of the mass of its midside node. At an edge between two fragments this half moves
+        with the end: a midside node there is attached to neither fragment.
+
+        Args:
+            x: present positions (N, d) of the nodes, m.
+            v: velocities (N, d) of the nodes, m/s.
+            midside: midside nodes; None with linear displacement.
+        """
+        owned, fragment_of_node = self._is_owned, self.split.node_fragment
+        fragment, mass, positions, velocities = fragment_of_node[owned], self.mass[owned], x[owned], v[owned]
+        if midside is not None:
+            ends = midside.ends
+            inside = (fragment_of_node[ends[:, 0]] == fragment_of_node[ends[:, 1]])[:, None]
+            fragment = np.concatenate([fragment, *fragment_of_node[ends].T])
+            mass = np.concatenate([midside.corner_share * mass, 0.5 * midside.mass, 0.5 * midside.mass])
+            positions = np.concatenate([positions, *(np.where(inside, midside.x, x[end]) for end in ends.T)])
+            velocities = np.concatenate([velocities, *(np.where(inside, midside.v, v[end]) for end in ends.T)])
+        add = partial(total, self.part)
+        table = tabulate_fragments(self.fragment_names, fragment, mass, self.volume, positions, velocities, add)
+        return replace(table, nodes=self.fragment_nodes)
 
     def make_rigid_frame(
         self, t: float, points: Values, velocity: Values, fragments: FragmentTable, broken_at: Values | None = None

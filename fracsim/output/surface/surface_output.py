@@ -12,16 +12,18 @@ import numpy as np
 import numpy.typing as npt
 
 from ...fracture.edge_history import EdgeHistory
+from ...mechanics.inertia import corner_mass_fraction
 from ...mechanics.material_fields import PerCell
 from ...mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
 from ...mesh.domain import Domain
-from ...mesh.ghost_exchange import with_ghosts
+from ...mesh.ghost_exchange import sum_at_nodes, with_ghosts
 from ...mesh.split_surface.mesh_part import RankCells
+from ...meshes.topology import signed_measures
 from ...timestepping.state import State
 from ..atomic_write import write_on_root
 from ..fields_file import Field
 from ..result_checks import InterpenetrationMonitor
-from .body_surface import BodySurface, SurfaceFrame
+from .body_surface import BodySurface, MidsideMotion, SurfaceFrame
 from .vtk_files import SurfaceFiles
 
 Rows = npt.NDArray[Any]
@@ -67,6 +69,28 @@ class RankValues:
             skeleton.edge_values(keys, history.break_times[rows]),
             skeleton.edge_values(keys, history.cut_positions[rows]),
         )
+
+
+class MidsideMasses:
+    """Lumped masses of the midside nodes that this rank owns, with quadratic displacement."""
+
+    def __init__(self, domain: Domain, part: RankCells, density: PerCell) -> None:
+        """Sum the masses (collective); `density`: kg/m^3 (2D: kg/m^2)."""
+        self._domain, middles = domain, domain.cell_midside_nodes
+        volume = signed_measures(domain.nodes, domain.cell_nodes)
+        corner, of_edge = corner_mass_fraction(domain), middles.of_edges
+        # the rest of the mass of a cell, in equal parts
+        share = (1 - (domain.dim + 1) * corner) / of_edge.shape[1] * density * volume
+        mass = sum_at_nodes(domain, of_edge, share[:, None])[:, 0]
+        is_owned = middles.nodes < domain.node_count
+        self._nodes, self._ends = middles.nodes[is_owned], part.part_node[middles.ends[is_owned]]
+        self._mass, self._corner_share = mass[self._nodes], (domain.dim + 1) * corner
+
+    def motion(self, state: State) -> MidsideMotion:
+        """Masses and motion of the midside nodes in a state."""
+        u, v = (of_dofs.reshape(-1, self._domain.dim)[self._nodes] for of_dofs in (state.u, state.v))
+        x = self._domain.nodes[self._nodes] + u
+        return MidsideMotion(self._ends, self._mass, x, v, self._corner_share)
 
 
 class SurfaceOutput:
@@ -121,6 +145,7 @@ class SurfaceOutput:
             )
         times = domain.comm.bcast([] if self.files is None or resume_at is None else self.files.times)
         self.surface = BodySurface(self._values.part, cell_density, smooth=smooth)
+        self._midside = MidsideMasses(domain, self._values.part, density) if domain.order == 2 else None
         if record is not None and times:
             self.surface.replay_fragment_names(self._values.of_broken_edges(record)[0], times)
 
@@ -144,7 +169,10 @@ class SurfaceOutput:
             if field.centre == "Cell"
         ]
         corrections = [partial(term.separate_surface, u=state.u, t=state.t) for term in self._separators]
-        return self.surface.make_frame(state.t, u, v, broken_at=broken_at, fields=cell_fields, corrections=corrections)
+        midside = None if self._midside is None else self._midside.motion(state)
+        return self.surface.make_frame(
+            state.t, u, v, broken_at=broken_at, fields=cell_fields, corrections=corrections, midside=midside
+        )
 
     def _cells_with_elements(self) -> npt.NDArray[np.bool_]:
         """Flags (cells,) of the cells of this rank that have elements of the surface."""
