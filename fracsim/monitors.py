@@ -26,7 +26,7 @@ if TYPE_CHECKING:
         SelfContactTerm,
     )
     from .output.history import History
-    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor, RotationStressMonitor
+    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor, RotationStrainMonitor
     from .scene import Scene
     from .study import Study
     from .timestepping.state import State
@@ -65,7 +65,7 @@ class RunMonitors:
         obstacle_overlap: overlap of obstacles with one another; None without several obstacles, one of them free.
         interpenetration: of fragments; None without a surface.
         intersections: of facets in contact of the body with itself; None without it, and in explicit steps.
-        rotation: stress from rotation in a step; None without fracture, and with schemes that add none.
+        rotation: strain from rotation in a step; None with schemes that add none.
         load_drop: ends the run when the load has dropped; None without `time.until`.
     """
 
@@ -201,14 +201,14 @@ def _intersection_monitor(scene: Scene) -> IntersectionMonitor | None:
     return IntersectionMonitor(cast("SelfContactTerm", term))
 
 
-def _rotation_monitor(scene: Scene) -> RotationStressMonitor | None:
-    """Return the monitor of stress from rotation, if forces balance between the ends of a step and edges may break."""
+def _rotation_monitor(scene: Scene) -> RotationStrainMonitor | None:
+    """Return the monitor of strain from rotation, if forces balance between the ends of a step."""
     stress, alpha_f = scene.balance.stress, scene.balance.scheme.alpha_f
-    if scene.fracture is None or not 0 < alpha_f < 1 or stress.energy.linear:
+    if not 0 < alpha_f < 1 or stress.energy.linear:
         return None
-    from .output.result_checks import RotationStressMonitor
+    from .output.result_checks import RotationStrainMonitor
 
-    return RotationStressMonitor(stress, scene.fracture, alpha_f)
+    return RotationStrainMonitor(stress, scene.fracture, alpha_f)
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

@@ -170,3 +170,17 @@ def test_stress_from_rotation_in_a_step_is_told(
     heard = capsys.readouterr().err
     assert ("cells rotated by 0.1 rad in the step to t = 0.01 s" in heard) == told
     assert ("a stress of 3.1 of the strength" in heard) == told
+
+
+@pytest.mark.parametrize(("step", "told"), ((0.01, True), (5e-3, False)))
+def test_strain_from_rotation_is_told_without_fracture(
+    step: float, told: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With rho = 0.8 steps of 0.1 rad add a strain of (20/81) 0.1^2 / 2 = 0.0012, of 0.05 rad a quarter of that."""
+    spinning = make_study(
+        mesh={"builder": "box", "size": [0.4, 0.1], "h": 0.05}, initial={"spin": [10.0]},
+        material={"energy": "neo-hookean", "young": 5e7, "poisson": 0.0, "density": 1000.0},
+        time={"scheme": "generalized-alpha", "step": step, "end": 0.02}, output={"picture": False},
+    )  # fmt: skip
+    Run(build_scene(MPI.COMM_SELF, spinning), tmp_path)()
+    assert ("a strain of 0.0012; try" in capsys.readouterr().err) == told

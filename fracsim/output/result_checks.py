@@ -17,7 +17,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mechanics.stress import Stress
+from ..mesh.domain import owned_input_cells
 from ..mesh.parallel import sum_over_ranks
+from ..mesh.small_matrices import inverse_transpose
 from ..meshes.data import format_point
 from ..meshes.topology import determinants
 from ..timestepping.state import State
@@ -42,7 +44,9 @@ class CheckTolerances:
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
         min_tension: share of the largest stress below which a principal stress is round-off.
-        rotation_stress: share of the strength from which stress that comes from rotation in a step is noted.
+        rotation_strain: strain from rotation in a step from which it is noted, without a strength.
+        rotation_stress: share of the strength from which the stress of that strain is noted.
+        rotation_cells: cells that are looked at for it, at most.
         cells_per_part: cells whose Jacobians are computed at a time.
     """
 
@@ -51,7 +55,9 @@ class CheckTolerances:
     single_step_share: float = 0.5
     min_jacobian: float = 1e-6
     min_tension: float = 1e-9
+    rotation_strain: float = 1e-3
     rotation_stress: float = 0.1
+    rotation_cells: int = 20_000
     cells_per_part: int = 16_000
 
 
@@ -220,24 +226,28 @@ class InvertedCellMonitor:
         )
 
 
-class RotationStressMonitor:
-    """Largest stress that a scheme adds to cells that rotate, as a share of their strength.
+class RotationStrainMonitor:
+    """Largest strain that a scheme adds to cells that rotate, and its stress as a share of their strength.
 
     Where forces balance at (1 - alpha_f) u_{n+1} + alpha_f u_n, a cell that rotates by an angle theta in a step is
-    shortened there. At the end of the step it is longer by alpha_f (1 - alpha_f) theta^2 / 2.
+    shortened there. At the end of the step it is longer by alpha_f (1 - alpha_f) theta^2 / 2. At most
+    `CHECK_TOLERANCES.rotation_cells` cells are looked at, the same on any number of ranks.
 
     Attributes:
-        largest: share of the strength so far, angle in rad and time in s; zeros at the start.
+        largest: strain over the strain from which it is noted, the strain, share of the strength (0: without
+            fracture), angle in rad and time in s; zeros at the start.
     """
 
-    _cells: Ints
-
-    def __init__(self, stress: Stress, fracture: FracturePass, alpha_f: float) -> None:
+    def __init__(self, stress: Stress, fracture: FracturePass | None, alpha_f: float) -> None:
         """Start without any frame; `alpha_f`: weight of the start of a step in the balance of forces."""
         self._stress, self._fracture, self._factor = stress, fracture, alpha_f * (1 - alpha_f) / 2
-        self._velocity = fem.Function(stress.domain.space)
-        self._dt, self._cells = 0.0, np.arange(stress.domain.cell_count, dtype=np.int64)
-        self.largest = (0.0, 0.0, 0.0)
+        # a criterion of a user may have none
+        self._strength = None if fracture is None else getattr(fracture.criterion, "strength", None)
+        domain, limit = stress.domain, CHECK_TOLERANCES.rotation_cells
+        interval = -(-domain.mesh.topology.index_map(domain.dim).size_global // limit)
+        self._sample = np.flatnonzero(owned_input_cells(domain.mesh) % interval == 0)
+        self._velocity, self._dt, self._cells = fem.Function(domain.space), 0.0, self._sample
+        self.largest = (0.0,) * 5
 
     def record_step(self, state: State, dt: float) -> None:
         """Record the velocity at the end of a step of dt in s."""
@@ -245,46 +255,53 @@ class RotationStressMonitor:
 
     def record_frame(self, t: float) -> None:
         """Record the rotation of cells that carried stress at the frame before, at time t in s (collective)."""
-        domain, strength = self._stress.domain, getattr(self._fracture.criterion, "strength", None)
-        if strength is None:
-            return
+        domain, cells = self._stress.domain, self._cells
+        if self._fracture is not None:
+            self._cells = self._sample[~self._fracture.graph.split[self._sample]]
         self._velocity.x.scatter_forward()
-        cells, self._cells = self._cells, np.flatnonzero(~self._fracture.graph.split)
         velocities = self._velocity.x.array.reshape(-1, domain.dim)[domain.cell_nodes[cells]]
         corners = self._stress.cell_corners(cells)
         edges, rates = (values[:, 1:] - values[:, :1] for values in (corners, velocities))
         solid = determinants(edges.transpose(1, 2, 0)) != 0
-        cells, gradient = cells[solid], np.linalg.solve(edges[solid], rates[solid])
+        # transposes of grad v
+        gradient = np.einsum("nkj,nki->nji", inverse_transpose(edges[solid]), rates[solid])
         skew = (gradient - gradient.transpose(0, 2, 1)) / 2
         angle = self._dt * np.sqrt(np.sum(skew**2, axis=(1, 2)) / 2)
-        young = np.broadcast_to(self._stress.material.young, domain.cell_count)[cells]
-        share = young * self._factor * angle**2 / strength.minimum_in(cells)
+        strain = self._factor * angle**2
+        share, excess = np.zeros(len(strain)), strain / CHECK_TOLERANCES.rotation_strain
+        if self._strength is not None:
+            cells = cells[solid]
+            young = np.broadcast_to(self._stress.material.young, domain.cell_count)[cells]
+            share = young * strain / self._strength.minimum_in(cells)
+            excess = share / CHECK_TOLERANCES.rotation_stress
+        figures = np.stack([excess, strain, share, angle, np.full(len(angle), t)], axis=1)
         # a rank without cells has no row
-        rows = [(float(share[cell]), float(angle[cell]), t) for cell in np.argsort(share)[-1:]]
+        rows = [tuple(figures[cell].tolist()) for cell in np.argsort(excess)[-1:]]
         self.largest = max(
             [self.largest, *(row for rows_of_rank in domain.comm.allgather(rows) for row in rows_of_rank)]
         )
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Values for `from_checkpoint`."""
-        return {"rotation_stress": list(self.largest)}
+        return {"rotation_strain": list(self.largest)}
 
     def from_checkpoint(self, monitors: dict[str, Any]) -> None:
         """Restore the values of `to_checkpoint`."""
-        self.largest = tuple(monitors.get("rotation_stress", self.largest))
+        self.largest = tuple(monitors.get("rotation_strain", self.largest))
 
     def summary(self) -> dict[str, Any]:
         """Return nothing: it has no part of summary.json."""
         return {}
 
     def notes(self) -> list[str]:
-        """Sentence about stress that comes from rotation, if it is more than a tenth of the strength."""
-        share, angle, t = self.largest
-        if share < CHECK_TOLERANCES.rotation_stress:
+        """Sentence about strain that comes from rotation, if it is large."""
+        excess, strain, share, angle, t = self.largest
+        if excess < 1:
             return []
+        stress = f", a stress of {share:.2g} of the strength, which may break them" if share else ""
         return [
             f"cells rotated by {angle:.2g} rad in the step to t = {t:g} s: the scheme stretches them by "
-            f"{self._factor:.2g} of its square, a stress of {share:.2g} of the strength, which may break them; "
+            f"{self._factor:.2g} of its square, a strain of {strain:.2g}{stress}; "
             'try time.scheme = "newmark" or "backward-euler", or a shorter time.step'
         ]
 
