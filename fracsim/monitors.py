@@ -11,12 +11,14 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 from .output.result_checks import (
     EnergyBalanceMonitor,
     InvertedCellMonitor,
+    MissedPeakMonitor,
     negligible_energy,
     unbroken_note,
     untested_balance_note,
 )
 from .output.run_folder import software_versions
 from .output.summary import ResourceMeter, irregular_event_text
+from .study.conditions import tabulated_conditions
 
 if TYPE_CHECKING:
     from .output.contact_checks import (
@@ -66,6 +68,7 @@ class RunMonitors:
         interpenetration: of fragments; None without a surface.
         intersections: of facets in contact of the body with itself; None without it, and in explicit steps.
         rotation: strain from rotation in a step; None with schemes that add none.
+        missed_peak: peaks of tables over time within a step; None without such tables.
         load_drop: ends the run when the load has dropped; None without `time.until`.
     """
 
@@ -80,8 +83,9 @@ class RunMonitors:
         self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
         self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
         self.intersections, self.rotation = _intersection_monitor(scene), _rotation_monitor(scene)
+        self.missed_peak = _missed_peak_monitor(scene)
         of_contact = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.intersections)
-        optional = (*of_contact, self.load_drop, self.rotation)
+        optional = (*of_contact, self.load_drop, self.rotation, self.missed_peak)
         self._optional: list[Monitor] = [monitor for monitor in optional if monitor is not None]
 
     @property
@@ -97,6 +101,8 @@ class RunMonitors:
             self.load_drop.record_step(state.t, figures, broken)
         if self.rotation is not None:
             self.rotation.record_step(state, report.dt)
+        if self.missed_peak is not None:
+            self.missed_peak.record_step(state.t, report.dt)
         self.energy_balance.record_step(report, state)
 
     def record_frame(self, t: float) -> None:
@@ -156,6 +162,8 @@ class RunMonitors:
             notes += self.intersections.notes()
         if self.rotation is not None:
             notes += self.rotation.notes()
+        if self.missed_peak is not None:
+            notes += self.missed_peak.notes()
         return notes
 
 
@@ -209,6 +217,12 @@ def _rotation_monitor(scene: Scene) -> RotationStrainMonitor | None:
     from .output.result_checks import RotationStrainMonitor
 
     return RotationStrainMonitor(stress, scene.fracture, alpha_f)
+
+
+def _missed_peak_monitor(scene: Scene) -> MissedPeakMonitor | None:
+    """Return the monitor of peaks within a step, if a load or a motion has a table over time."""
+    tables = tabulated_conditions(scene.study, scene.domain.dim)
+    return MissedPeakMonitor(tables, scene.study.time.end) if tables else None
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+from fracsim.deformable_run import run_study
 from fracsim.forms.schemes import BackwardEuler, Newmark
+from fracsim.output.result_checks import MissedPeakMonitor
 from fracsim.scene import Scene, make_scheme
+from fracsim.study.conditions import tabulated_conditions
 from fracsim.timestepping.state import State
 from support.oscillator import exact, run, slopes
 from support.reference import lumped_mass, modes, stiffness
-from support.scenes import DIRECT, Values, each_step, make_scene, march, positions
+from support.scenes import DIRECT, Values, each_step, make_scene, make_study, march, positions
 
 EPS = np.finfo(float).eps
 MATERIAL = {"energy": "linear", "young": 2.0, "poisson": 0.3, "density": 3.0}
@@ -305,3 +312,52 @@ def test_a_grip_that_starts_at_once_moves_as_it_is_told(scheme: str) -> None:
         gaps.append(gap)
     assert gaps[1] < 0.6 * gaps[0] or gaps[1] < 1e-9
     assert gaps[1] < (0.2 if scheme == "backward-euler" else 5e-3)
+
+
+# --- peaks of tables within a step ---
+
+
+def missed(entry: dict[str, Any], ends: list[float]) -> MissedPeakMonitor:
+    """A monitor that has recorded steps with these ends, of a study with an entry of [[boundary]] on the right."""
+    study = make_study(boundary=[*CLAMP, {"on": "right"} | entry])
+    monitor = MissedPeakMonitor(tabulated_conditions(study, 2), 1.0)
+    for before, t in pairwise([0.0, *ends]):
+        monitor.record_step(t, t - before)
+    return monitor
+
+
+PULSE = {"time": [0.4, 0.45, 0.5], "value": [0.0, 2.0, 0.0]}
+
+
+def test_a_pulse_within_a_step_is_told() -> None:
+    """By 2 Pa of pressure of 2 Pa; where a step ends on the flank, at 1.2 Pa, by 0.8 Pa."""
+    monitor = missed({"pressure": PULSE}, [0.2, 0.4, 0.6, 0.8, 1.0])
+    (note,) = monitor.notes()
+    assert note.startswith(
+        "boundary.1.pressure has a peak at t = 0.45 s within a step of 0.2 s, and 100% of its largest"
+    )
+    again = missed({"pressure": PULSE}, [])
+    again.from_checkpoint(json.loads(json.dumps(monitor.to_checkpoint())))
+    assert again.notes() == [note]
+    assert "and 40% of its largest" in missed({"pressure": PULSE}, [0.2, 0.43, 0.6]).notes()[0]
+    there_and_back = {"time": [0.4, 0.5, 0.6], "value": [["free", 0.0], ["free", -1.0], ["free", 0.0]]}
+    assert missed({"displacement": there_and_back}, [0.4, 0.6]).notes()
+
+
+def test_what_steps_see_is_not_told() -> None:
+    """A pulse whose peak is the end of a step, a jump within a step, and a pulse of velocity, whose way is exact."""
+    assert missed({"pressure": PULSE}, [0.2, 0.45, 0.7]).notes() == []
+    jump = {"time": [0.0, 0.5, 0.51], "value": [0.0, 0.0, 2.0]}
+    assert missed({"pressure": jump}, [0.3, 0.6, 1.0]).notes() == []
+    blow = {"time": [0.4, 0.45, 0.5], "value": [[0.0, 0.0], [2.0, 0.0], [0.0, 0.0]]}
+    assert missed({"velocity": blow}, [0.2, 0.6]).notes() == []
+
+
+def test_a_run_tells_of_a_pulse_that_no_step_saw(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    study = make_study(
+        boundary=[*CLAMP, {"on": "right", "pressure": PULSE}],
+        time={"scheme": "quasi-static", "step": 0.2, "end": 1.0},
+        output={"picture": False},
+    )
+    run_study(MPI.COMM_WORLD, study, tmp_path / "out")
+    assert "boundary.1.pressure has a peak at t = 0.45 s within a step of 0.2 s" in capfd.readouterr().err

@@ -17,6 +17,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mechanics.stress import Stress
+from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import owned_input_cells
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.small_matrices import inverse_transpose
@@ -47,6 +48,7 @@ class CheckTolerances:
         rotation_strain: strain from rotation in a step from which it is noted, without a strength.
         rotation_stress: share of the strength from which the stress of that strain is noted.
         rotation_cells: cells that are looked at for it, at most.
+        missed_peak: share of the largest value of a table over time from which a peak within a step is noted.
         cells_per_part: cells whose Jacobians are computed at a time.
     """
 
@@ -58,6 +60,7 @@ class CheckTolerances:
     rotation_strain: float = 1e-3
     rotation_stress: float = 0.1
     rotation_cells: int = 20_000
+    missed_peak: float = 0.1
     cells_per_part: int = 16_000
 
 
@@ -427,6 +430,63 @@ class InterpenetrationMonitor:
         return [
             f"pieces {first} and {second} pass through each other{spite}, first seen at "
             f"t = {self.first_overlap['time']:g} s near {format_point(self.first_overlap['place'])}; {remedy}"
+        ]
+
+
+class MissedPeakMonitor:
+    """Largest peak of a table over time that lies within a step, beyond the values at both of its ends.
+
+    Forces are balanced once per step: such a peak does not act on the body.
+    """
+
+    def __init__(self, tables: dict[str, tuple[Values, TimeFunction]], end: float) -> None:
+        """Start without any step.
+
+        Args:
+            tables: times (n,), s, and function of time by key.
+            end: end of the run, s.
+        """
+        self._tables = []
+        for key, (times, function) in tables.items():
+            within = times[(times > 0) & (times < end)]
+            corners = np.array([function(t) for t in [0.0, *within, end]])
+            if (scale := float(np.abs(corners).max())) > 0:
+                self._tables.append((key, within, corners[1:-1], function, scale))
+        # key, time in s, step in s, share of the largest value
+        self._largest: tuple[str, float, float, float] = ("", 0.0, 0.0, 0.0)
+
+    def record_step(self, t: float, dt: float) -> None:
+        """Record a finished step of dt (s) that ends at t (s)."""
+        for key, times, corners, function, scale in self._tables:
+            inner = (times > t - dt) & (times < t)
+            if not inner.any():
+                continue
+            ends = np.array([function(t - dt), function(t)])
+            beyond = np.maximum(corners[inner] - ends.max(axis=0), ends.min(axis=0) - corners[inner]).max(axis=1)
+            share, peak_time = float(beyond.max()) / scale, float(times[inner][beyond.argmax()])
+            if share > self._largest[3]:
+                self._largest = key, peak_time, dt, share
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"missed_peak": list(self._largest)}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self._largest = tuple(monitors.get("missed_peak", self._largest))
+
+    def summary(self) -> dict[str, Any]:
+        """Part of summary.json: none."""
+        return {}
+
+    def notes(self) -> list[str]:
+        """Sentence on the largest peak that no step ended at, if there is one."""
+        key, t, dt, share = self._largest
+        if share < CHECK_TOLERANCES.missed_peak:
+            return []
+        return [
+            f"{key} has a peak at t = {t:g} s within a step of {dt:g} s, and {share:.0%} of its largest value did not "
+            "act: take a shorter time.step, or a table of steps with this time"
         ]
 
 

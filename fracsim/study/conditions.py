@@ -255,6 +255,27 @@ def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
     return {name: time_function(value, f"load.{name}", dim) for name, value in values.items() if value is not None}
 
 
+def tabulated_conditions(study: Study, dim: int) -> dict[str, tuple[Values, TimeFunction]]:
+    """Returns times (n,), s, and the function of each table over time of a load or a motion, by its key.
+
+    That of a velocity is the displacement, its integral.
+    """
+    of_boundary = [(f"boundary.{i}.{entry.kind}", getattr(entry, entry.kind)) for i, entry in enumerate(study.boundary)]
+    of_load = [] if study.load is None else [("load.body_force", study.load.body_force)]
+    of_obstacles = [
+        (f"obstacle.{i}.{name}", getattr(entry, name))
+        for i, entry in enumerate(study.obstacle)
+        for name in ("displacement", "velocity")
+    ]
+    result: dict[str, tuple[Values, TimeFunction]] = {}
+    for key, value in [*of_boundary, *of_load, *of_obstacles]:
+        if isinstance(value, TimeTable):
+            table = time_function(value, key, 1 if key.endswith("pressure") else dim)
+            prescribed = TabulatedFunction(table.times, np.nan_to_num(table.rows))
+            result[key] = table.times, prescribed.integral if key.endswith("velocity") else prescribed
+    return result
+
+
 def obstacle_placements(study: Study, dim: int) -> list[ObstaclePlacement]:
     """Returns all entries of [[obstacle]].
 
