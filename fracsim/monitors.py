@@ -19,6 +19,7 @@ from .output.result_checks import (
 from .output.run_folder import software_versions
 from .output.summary import ResourceMeter, irregular_event_text
 from .study.conditions import tabulated_conditions
+from .study.quadratic_checks import corner_contact_note
 
 if TYPE_CHECKING:
     from .output.contact_checks import (
@@ -148,7 +149,8 @@ class RunMonitors:
         energy, time = self._study.material.energy, self._study.time
         trouble = irregular_event_text(self.meter.read_totals()["trouble"])
         untested = untested_balance_note(self._study.solver, is_linear=self._is_linear)
-        of_all = (trouble, untested, self.inverted.note(energy), self.energy_balance.note(time.scheme))
+        corners = corner_contact_note(self._study)
+        of_all = (trouble, untested, corners, self.inverted.note(energy), self.energy_balance.note(time.scheme))
         notes = [note for note in of_all if note]
         if done and self._fracture is not None and (unbroken := unbroken_note(self._fracture)):
             notes.append(unbroken)

@@ -339,6 +339,20 @@ def test_check_says_what_is_built() -> None:
     assert "quadratic" not in "\n".join(check_study(make_study()))
 
 
+def test_contact_on_corners_alone_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Where edges may break midside nodes penetrate: two blocks pressed together have 7/8 of their force."""
+    mesh = {"builder": "box", "size": [1.0, 1.0], "h": 0.5, "order": 2}
+    tables: dict[str, Any] = {"mesh": mesh, "fracture": {"strength": 1.0}, "contact": {"itself": True}}
+    said = "acts on corners alone, and may lack an eighth of its force"
+    assert said in " ".join("\n".join(check_study(make_study(**tables))).split())
+    without = [{"mesh": mesh | {"order": 1}}, {"contact": None}, {"fracture": None}]
+    for changed in without:
+        assert "on corners" not in "\n".join(check_study(make_study(**(tables | changed))))
+    time = {"scheme": "newmark", "step": 0.1, "end": 0.1}
+    run_study(MPI.COMM_WORLD, make_study(**tables, time=time, output={"picture": False}), tmp_path / "out")
+    assert said in capfd.readouterr().err
+
+
 def test_check_notes_linear_cells_that_lock() -> None:
     rubber = {"energy": "linear", "young": 1.0, "poisson": 0.49, "density": 1.0}
     assert "linear cells lock at a Poisson's ratio of 0.49" in "\n".join(check_study(make_study(material=rubber)))

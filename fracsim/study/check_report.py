@@ -6,6 +6,7 @@ fracture energies in N/mm. The thresholds are far from all materials of `materia
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator
 from math import inf, sqrt
 from pathlib import Path
@@ -26,7 +27,7 @@ from .length_checks import (
 from .load_resultants import resultant_lines
 from .mesh_source import find_builder, read_obstacle_surface
 from .mesh_summary import MeshSummary
-from .quadratic_checks import has_curved_cells
+from .quadratic_checks import corner_contact_note, has_curved_cells
 from .step_checks import time_step_lines
 
 # nodes of a mesh with quadratic displacement over those with linear displacement: edges have nodes, too
@@ -171,6 +172,8 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         if study.fracture is not None and implicit and not between_fragments:
             yield f"{_INDENT}note: where a soft body tears, contact of cracks inside a fragment takes 30 to 65 times"
             yield f'{_INDENT}the rest of a step; contact.itself = "pieces" leaves it out, and takes up to a third'
+    if note := corner_contact_note(study):
+        yield from (f"{_INDENT}{line}" for line in textwrap.wrap(f"note: {note}", 96))
 
 
 def _time_lines(study: Study, summary: MeshSummary) -> Iterator[str]:

@@ -49,6 +49,18 @@ def _unsupported_keys(study: Study) -> list[tuple[str, bool, str]]:
     ]
 
 
+def corner_contact_note(study: Study) -> str:
+    """Returns a sentence if surfaces are in contact by corners alone, so that midside nodes penetrate; else ""."""
+    with_itself = study.contact is not None and bool(study.contact.itself)
+    from_file = any(obstacle.shape == "mesh" for obstacle in study.obstacle)
+    if study.mesh.order == 1 or study.fracture is None or not (with_itself or from_file):
+        return ""
+    return (
+        "mesh.order = 2 with [fracture]: contact of the body with itself and with obstacles from files acts on corners "
+        "alone, and may lack an eighth of its force"
+    )
+
+
 def has_curved_cells(study: Study, builder: Any) -> bool:
     """Returns whether boundary cells of the study are curved; `builder` is that of its mesh, None for a file."""
     straight = study.mesh.order == 1 or study.fracture is not None or study.plasticity is not None
