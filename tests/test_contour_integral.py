@@ -46,6 +46,39 @@ def test_where_nothing_is_cracked_it_vanishes(energy: str) -> None:
     assert np.all(np.abs(scene.probes()) < 0.01 * 0.3 * report.elastic)
 
 
+@pytest.mark.parametrize("energy", ["linear", "neo-hookean"])
+def test_where_nothing_is_cracked_weight_makes_none(energy: str) -> None:
+    """A block that hangs by its top: the weight within the radius is not the energy of a crack."""
+    study = make_study(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.05, "pattern": "unstructured"},
+        material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
+        boundary=[{"on": "top", "fix": "xy"}], load={"gravity": [0.0, -0.1], "body_force": [0.05, -0.1]},
+        probe=contours((0.3,), (0.5, 0.5)), time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )  # fmt: skip
+    scene = build_scene(MPI.COMM_SELF, study)
+    _, report = scene.stepper.advance(scene.start())
+    assert np.all(np.abs(scene.probes()) < 0.02 * 0.3 * report.elastic)
+
+
+def test_a_crack_under_weight_releases_the_energy_of_two_layers() -> None:
+    """A layer held above and below, with a crack at a quarter of its height H: two layers of h_1 and h_2 behind it.
+
+    G = f^2 (h_1^3 + h_2^3) / 6 E - f^2 H^3 / 24 E without Poisson's ratio.
+    """
+    mesh = {"builder": "box", "size": [6.0, 1.0], "h": 0.05, "pattern": "unstructured"}
+    study = make_study(
+        mesh=mesh, fracture={"strength": 1e6}, crack=[{"segment": [[-0.1, 0.75], [3.0, 0.75]]}],
+        boundary=[{"on": side, "fix": "xy"} for side in ("bottom", "top")], load={"body_force": [0.0, -1e-2]},
+        probe=contours((0.16, 0.24), (3.0, 0.75)), time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )  # fmt: skip
+    scene = build_scene(MPI.COMM_SELF, study)
+    scene.stepper.advance(scene.start())
+    expected = 1e-4 * ((0.75**3 + 0.25**3) / 6 - 1 / 24)
+    along = scene.probes().reshape(2, 2)[:, 0]
+    assert along == pytest.approx([expected] * 2, rel=0.08)
+    assert along[1] == pytest.approx(along[0], rel=0.05)
+
+
 def test_what_it_needs_is_said() -> None:
     with pytest.raises(ValueError, match="give point, neither on nor record"):
         make_study(probe=[{"name": "a", "on": "left", "contour": 0.1}])

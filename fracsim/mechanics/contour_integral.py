@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 from dolfinx import fem
+from ufl.core.expr import Expr
 
 from ..errors import InputError
 from ..mesh.parallel import sum_over_ranks
@@ -18,11 +19,13 @@ Values = npt.NDArray[np.float64]
 class ContourIntegral:
     """J-integral of a body in equilibrium, as a vector (d,), J/m^2; in 3D the force on the front in the ball, N.
 
-    J = - int (psi I - H^T P) grad q dX, where q falls linearly from 1 at radius / 2 to 0 at the radius (Rice 1968; Li,
-    Shih and Needleman 1985). psi and P are those of the damaged body.
+    J = - int (psi I - H^T P) grad q dX - int q H^T f dX, where q falls linearly from 1 at radius / 2 to 0 at the radius
+    (Rice 1968; Li, Shih and Needleman 1985). psi and P are those of the damaged body, f is the force per volume.
     """
 
-    def __init__(self, stress: Stress, centre: Values, radius: float, key: str) -> None:
+    def __init__(
+        self, stress: Stress, centre: Values, radius: float, key: str, volume_force: Expr | None = None
+    ) -> None:
         """Compile the integral (collective).
 
         Args:
@@ -30,6 +33,7 @@ class ContourIntegral:
             centre: (d,) point at rest, m.
             radius: m.
             key: of the radius in the study, for errors.
+            volume_force: UFL vector, N/m^3; None: there is none.
 
         Raises:
             InputError: no cell has its corners on either side of the ring.
@@ -50,8 +54,15 @@ class ContourIntegral:
         psi, P, _ = energy_derivatives(stress)
         eshelby = psi * ufl.Identity(domain.dim) - ufl.grad(stress.u).T * P
         force, dx = -eshelby * ufl.grad(q), cell_measure(domain, cells)
-        self._forms = [compile_form(force[axis] * dx) for axis in range(domain.dim)]
+        integrals = [(force, dx)]
+        if volume_force is not None:
+            within = cell_measure(domain, np.flatnonzero(corners.max(axis=1, initial=0.0) > 0).astype(np.int32))
+            integrals.append((-q * (ufl.grad(stress.u).T * volume_force), within))
+        # DOLFINx takes one set of cells a form
+        self._forms = [
+            [compile_form(vector[axis] * measure) for vector, measure in integrals] for axis in range(domain.dim)
+        ]
 
     def __call__(self) -> Values:
         """Return the part (d,) of this rank at the present displacement."""
-        return np.array([fem.assemble_scalar(form) for form in self._forms])
+        return np.array([sum(fem.assemble_scalar(form) for form in forms) for forms in self._forms])

@@ -63,6 +63,7 @@ class DeadLoads(Term):
 
     Attributes:
         nodal_forces: (owned dofs,) forces of all loads at the time level, N.
+        volume_force: gravity and body force at the time level as a UFL vector, N/m^3; None without them.
     """
 
     name = "dead loads"
@@ -100,8 +101,9 @@ class DeadLoads(Term):
             traction_work(self._constants.constant(traction, d), w, ds)
             for (_, traction), ds in zip(tractions, surface_measures(domain, facets), strict=True)
         ]
-        if densities:
-            works.append(ufl.inner(sum(densities[1:], densities[0]), w) * dx)
+        self.volume_force: Expr | None = sum(densities[1:], densities[0]) if densities else None
+        if self.volume_force is not None:
+            works.append(ufl.inner(self.volume_force, w) * dx)
         self._form = compile_form(sum(works[1:], works[0])) if works else None
         self._weights: Values = np.zeros(assembler.owned_dof_count) if weights is None else weights
         self.nodal_forces: Values = self._weights

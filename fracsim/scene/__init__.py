@@ -25,6 +25,7 @@ from mpi4py import MPI  # noqa: E402
 
 from ..forms.schemes import Scheme  # noqa: E402
 from ..mechanics.balance import Balance  # noqa: E402
+from ..mechanics.loads import DeadLoads  # noqa: E402
 from ..mechanics.material_fields import MaterialFields  # noqa: E402
 from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
@@ -268,11 +269,13 @@ def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
 def _contours(study: Study, balance: Balance) -> dict[str, ContourIntegral]:
     """Return the J-integrals of [[probe]] by name (collective)."""
     contours = {}
+    loads = [term for term in balance.terms if isinstance(term, DeadLoads)]
+    volume_force = loads[0].volume_force if loads else None
     for i, entry in enumerate(study.probe):
         if entry.contour is not None:
             from ..mechanics.contour_integral import ContourIntegral
 
             assert entry.point is not None
             centre, key = check_size(entry.point, balance.domain.dim, f"probe.{i}.point"), f"probe.{i}.contour"
-            contours[entry.name] = ContourIntegral(balance.stress, centre, entry.contour, key)
+            contours[entry.name] = ContourIntegral(balance.stress, centre, entry.contour, key, volume_force)
     return contours
