@@ -399,6 +399,17 @@ def test_momentum_of_a_piece_is_the_impulse_of_its_floor(dim: int) -> None:
     assert gained == pytest.approx(impulse, rel=1e-4)
 
 
+def test_mass_of_a_round_piece_is_that_of_round_sides() -> None:
+    """The drawn surface has straight sides; the mass that moves does not."""
+    scene, state = disk()
+    output = surface_output(None, scene.balance, FractureLog(scene.balance.stress, None), None, None, 1.0, smooth=False)
+    state.v = np.tile([1.0, 0.0], len(state.v) // 2)
+    fragments = output.make_frame(state.state, []).fragments
+    assert fragments.mass == pytest.approx([scene.balance.mass.lumped.sum() / 2])
+    assert fragments.volume == pytest.approx([scene.domain.volumes.sum()])
+    assert fragments.velocity == pytest.approx(np.array([[1.0, 0.0]]))
+
+
 def test_midside_nodes_between_pieces_do_not_move_the_pieces() -> None:
     """Two columns of nodes of a square torn off by hand: midside nodes of the broken edges are far away, pieces are
     not."""

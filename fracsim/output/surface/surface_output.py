@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import ufl
+from dolfinx import fem
 
 from ...fracture.edge_history import EdgeHistory
 from ...mechanics.inertia import corner_mass_fraction
+from ...mechanics.jit import compile_form
 from ...mechanics.material_fields import PerCell
 from ...mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
 from ...mesh.domain import Domain
@@ -93,6 +96,14 @@ class MidsideMasses:
         return MidsideMotion(self._ends, self._mass, x, v, self._corner_share)
 
 
+def _curved_volumes(domain: Domain) -> Values:
+    """Volumes (cells,), m^3 (2D: m^2), of cells with curved edges; the surface has straight ones."""
+    volumes = fem.Function(domain.scalar_cell_space)
+    form = compile_form(ufl.TestFunction(domain.scalar_cell_space) * ufl.dx(domain=domain.mesh))
+    fem.assemble_vector(volumes.x.array, form)
+    return np.asarray(volumes.x.array[: domain.cell_count])
+
+
 class SurfaceOutput:
     """Writer of surface.pvd and pieces.csv of a run with deformable bodies.
 
@@ -137,6 +148,8 @@ class SurfaceOutput:
         self._obstacle_terms, self._interpenetration, self._precision = beside, passing, precision
         self._path = (folder or Path()) / "surface.pvd"
         self._values = RankValues(domain)
+        if domain.has_curved_cells:
+            density = density * _curved_volumes(domain) / domain.volumes
         cell_density = self._values.of_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         self.files = None
         if folder is not None:
