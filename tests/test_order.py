@@ -229,6 +229,26 @@ def pressed(order: int, **more: Any) -> tuple[float, Any]:
     return force, state.u.reshape(-1, 2)[top, 1]
 
 
+@pytest.mark.parametrize(
+    ("mesh", "exact"),
+    [
+        ({"builder": "disk", "radius": 1.0, "h": 0.25}, 2 * np.pi),
+        ({"builder": "cylinder", "radius": 1.0, "length": 1.0, "h": 0.4}, 4 * np.pi),
+    ],
+)
+def test_all_of_a_round_body_touches(mesh: dict[str, Any], exact: float) -> None:
+    """The area of its contact surface is that of the body, and midside nodes are on the circle."""
+    scene, _ = make_scene(mesh=mesh | {"order": 2})
+    assert scene.domain.has_curved_cells
+    surface = ContactSurface(scene.domain, 0.01)
+    assert surface.area.sum() == pytest.approx(exact, rel=0.02)
+    nodes, points = (
+        np.count_nonzero(np.abs(np.linalg.norm(positions[:, :2], axis=1) - 1) < 1e-9)
+        for positions in (scene.domain.nodes, surface.rest_positions)
+    )
+    assert points == nodes
+
+
 def test_middles_touch_too() -> None:
     """A flat plate leaves the top flat, and a bar of linear cells carries the same; with contact at corners alone the
     top bulges by a twentieth of an edge and the force is an eighth too low."""

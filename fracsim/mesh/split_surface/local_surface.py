@@ -117,9 +117,10 @@ def local_mesh(domain: Domain) -> MeshData:
     """The cells of this rank as a mesh, with the boundary facets of the body as group OUTSIDE."""
     exterior = domain.facets.boundary
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
-    of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)
+    of_geometry = np.full(len(domain.mesh.geometry.x), -1, np.int64)
     of_geometry[domain.corner_geometry] = domain.cell_nodes
-    facets = of_geometry[geometry].reshape(-1, domain.dim)
+    # curved facets have midside nodes, too, behind their corners
+    facets = of_geometry[geometry.reshape(len(exterior), -1)[:, : domain.dim]]
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 
 
