@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 from .output.result_checks import (
     EnergyBalanceMonitor,
     InvertedCellMonitor,
-    MissedPeakMonitor,
     negligible_energy,
     unbroken_note,
     untested_balance_note,
@@ -29,7 +28,8 @@ if TYPE_CHECKING:
         SelfContactTerm,
     )
     from .output.history import History
-    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor, RotationStrainMonitor
+    from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor
+    from .output.step_size_checks import MissedPeakMonitor, RotationStrainMonitor
     from .scene import Scene
     from .study import Study
     from .timestepping.state import State
@@ -216,7 +216,7 @@ def _rotation_monitor(scene: Scene) -> RotationStrainMonitor | None:
     stress, alpha_f = scene.balance.stress, scene.balance.scheme.alpha_f
     if not 0 < alpha_f < 1 or stress.energy.linear:
         return None
-    from .output.result_checks import RotationStrainMonitor
+    from .output.step_size_checks import RotationStrainMonitor
 
     return RotationStrainMonitor(stress, scene.fracture, alpha_f)
 
@@ -224,7 +224,11 @@ def _rotation_monitor(scene: Scene) -> RotationStrainMonitor | None:
 def _missed_peak_monitor(scene: Scene) -> MissedPeakMonitor | None:
     """Return the monitor of peaks within a step, if a load or a motion has a table over time."""
     tables = tabulated_conditions(scene.study, scene.domain.dim)
-    return MissedPeakMonitor(tables, scene.study.time.end) if tables else None
+    if not tables:
+        return None
+    from .output.step_size_checks import MissedPeakMonitor
+
+    return MissedPeakMonitor(tables, scene.study.time.end)
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from fracsim.deformable_run import run_study
 from fracsim.forms.schemes import BackwardEuler, Newmark
-from fracsim.output.result_checks import MissedPeakMonitor
+from fracsim.output.step_size_checks import MissedPeakMonitor
 from fracsim.scene import Scene, make_scheme
 from fracsim.study.conditions import tabulated_conditions
 from fracsim.timestepping.state import State

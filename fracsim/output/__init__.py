@@ -16,6 +16,7 @@ progress          line of progress on the terminal
 result_checks     monitors of energy gain, inverted cells, interpenetration, load drop
 rigid_frames      frames of rigid bodies
 run_folder        output folder: checks before a run or restart, schedule of frames
+step_size_checks  monitors of strain from rotation in a step, and of peaks within a step
 summary           summary.json: outcome, times, memory
 surface           the split surface: surface.pvd, surface/*.vtu and pieces.csv
 tip_file          tips.csv: crack tips that are followed from step to step
