@@ -18,6 +18,7 @@ import urllib.request
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -189,7 +190,11 @@ def test_the_server_gives_new_frames_alone(run: Path, tmp_path: Path) -> None:
 def test_the_command_serves_until_it_is_interrupted(run: Path) -> None:
     env = os.environ | {"BROWSER": "true"}  # the program of that name opens nothing
     command = [sys.executable, "-m", "fracsim", "view", run]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env) as process:
+    # a shell that starts the tests in the background lets them ignore the signal
+    heeds = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=env, preexec_fn=heeds
+    ) as process:
         assert process.stdout is not None
         found = re.search(r"is shown at (http://127.0.0.1:\d+/) until you press Ctrl-C", process.stdout.readline())
         assert found is not None
