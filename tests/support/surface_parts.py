@@ -110,6 +110,7 @@ class WholeValues:
         mesh, self._domain = domain.input_mesh, domain
         assert mesh is not None
         self.part = WholeMesh(EntityNumbering(mesh))
+        self.part.part_node = domain.input_numbering.nodes  # type: ignore[attr-defined]
 
     def of_nodes(self, values: Values) -> Values:
         rows = self._domain.input_numbering.gather_nodes(values.reshape(-1, self._domain.dim))

@@ -69,7 +69,10 @@ def tabulate_fragments(
 
     weight = sum_nodes(mass)
     centre, velocity = (sum_nodes(mass[:, None] * values) / weight[:, None] for values in (x, v))
-    spin = _spin(sum_nodes, mass, x - centre[fragment_of_node], v - velocity[fragment_of_node])
+    r = x - centre[fragment_of_node]
+    # distances that are round-off of the centre: all masses of the fragment may be at one point
+    r[np.linalg.norm(r, axis=1) <= 1e-12 * np.linalg.norm(x, axis=1)] = 0.0
+    spin = _spin(sum_nodes, mass, r, v - velocity[fragment_of_node])
     nodes = total(np.bincount(fragment_of_node, minlength=len(name)))
     return FragmentTable(name, nodes, weight, volume, centre, velocity, spin)
 
