@@ -23,7 +23,8 @@ Laws and geometry:
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
     shape_kernels         compiled distances, closest points of facets and their energy; the modules beside it are plain
     triangle_mesh_shape   closed surfaces of triangles
-    clearance             bound of the distance from obstacles over many steps, while all are far; smallest gaps
+    clearance             points and facets that may be near an obstacle; bound of the distance over many steps, while
+                          all are far; smallest gaps
     supporting_obstacles  obstacles that a body is set down on
 
 Points and facets before analytic obstacles:

@@ -1,7 +1,11 @@
-"""Clearance: a bound of the distance between a body and obstacles, which holds for many steps.
+"""Searches for what is near obstacles, whose results hold for many steps.
 
-Nothing is searched while all is far. A search measures the gaps g_0 between points of the surface and an obstacle, at
-displacements u_0 and a pose (c_0, R_0). Since then a gap has lost at most
+Candidates: points and facets of a surface that may be near an obstacle, searched again only after large motions (L.
+Verlet 1967, Computer "experiments" on classical fluids I, Physical Review 159, 98: lists of neighbours).
+
+Clearance: a bound of the distance between a body and obstacles; nothing is searched while all is far. A search
+measures the gaps g_0 between points of the surface and an obstacle, at displacements u_0 and a pose (c_0, R_0). Since
+then a gap has lost at most
 
     A s + |c - c_0| + ||R - R_0|| r,    A = max_p sum_a |w_pa|,  s = max_a |u_a - u_0a|
 
@@ -53,6 +57,9 @@ class ClearancePolicy:
 CLEARANCE = ClearancePolicy()
 
 
+# --- candidates ---
+
+
 def bounding_box(x: Values) -> tuple[Values, Values]:
     """(d,) lowest and highest coordinates of points (n, d), m.
 
@@ -69,6 +76,94 @@ def outline_radius(posed: PosedShape) -> float:
     """
     points, _ = posed.shape.tessellate()
     return 1.1 * float(np.linalg.norm(points, axis=1).max())
+
+
+@dataclass(frozen=True)
+class ProximitySearch:
+    """Result of a search, and where it was made.
+
+    Attributes:
+        x: (n, d) points then, m.
+        posed: obstacle then.
+        distance: of what was asked for, m.
+        margin: by which what is farther away was found as well, m.
+        near: (k,) points or facets found.
+        radius: of the shape about its reference point, m.
+    """
+
+    x: Values
+    posed: PosedShape
+    distance: float
+    margin: float
+    near: Ints
+    radius: float
+
+    def is_valid(self, posed: PosedShape, motion: float, distance: float) -> bool:
+        """Whether nothing within that distance, m, can be missing; `motion`: largest of the points since then, m.
+
+        A distance changes by no more than the point moves, |t| of the obstacle, and ||R - R_0|| times its radius.
+        """
+        pose, old_pose = posed.pose, self.posed.pose
+        rotation = float(np.linalg.norm(pose.rotation - old_pose.rotation))
+        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (rotation and rotation * self.radius)
+        return distance - self.distance + motion + obstacle_motion <= self.margin
+
+
+class ProximityCandidates:
+    """Points, or facets, of a surface that may be near obstacles."""
+
+    def __init__(self, margin: float, corners: Ints | None = None) -> None:
+        """Candidates of a surface.
+
+        Args:
+            margin: motion, m, after which all are searched again.
+            corners: (m, c) points of facets; None: points are searched for.
+        """
+        self._least_margin, self._corners = margin, corners
+        self._searches: dict[int, ProximitySearch] = {}
+        self._motion: tuple[Values, ProximitySearch, float] | None = None  # the last that was computed
+        self._balls: tuple[Values, Values, Values] | None = None  # points, and centroids and radii of facets
+
+    def __call__(self, posed: PosedShape, x: Values, distance: float) -> Ints:
+        """(k,) those nearer than `distance`, m, to an obstacle, with points at x (n, d), m; others too, ascending."""
+        last = self._searches.get(id(posed.shape))
+        is_known = last is not None and last.posed.shape is posed.shape and last.x.shape == x.shape
+        if last is None or not is_known or not last.is_valid(posed, self._max_motion(last, x), distance):
+            last = self._searches[id(posed.shape)] = self._search(posed, x, distance)
+        return last.near
+
+    def _max_motion(self, last: ProximitySearch, x: Values) -> float:
+        """Largest motion of points since a search, m."""
+        if self._motion is None or self._motion[0] is not x or self._motion[1] is not last:
+            motion = x - last.x
+            self._motion = x, last, float(np.sqrt(np.einsum("nd,nd->n", motion, motion).max(initial=0.0)))
+        return self._motion[2]
+
+    def _search(self, posed: PosedShape, x: Values, distance: float) -> ProximitySearch:
+        margin, bound = max(self._least_margin, distance), posed.distance_bound(x)
+        if bound > distance + margin:  # all are far
+            return ProximitySearch(x, posed, distance, bound - distance, np.empty(0, np.int64), outline_radius(posed))
+        if self._corners is None:
+            gap = posed.distance(x)
+        else:
+            centroid, radius = self._bounding_balls(x)
+            margin = max(float(radius.mean()) if len(radius) else 0.0, margin)
+            gap = posed.distance(centroid) - radius
+        near = np.flatnonzero(gap < distance + margin)
+        return ProximitySearch(x, posed, distance, margin, near, outline_radius(posed))
+
+    def _bounding_balls(self, x: Values) -> tuple[Values, Values]:
+        """(m, d) centroids of the facets, and (m,) greatest distances of their corners from them, m."""
+        if self._balls is None or self._balls[0] is not x:
+            assert self._corners is not None
+            corners = [x[points] for points in self._corners.T]
+            centroid = sum(corners[1:], corners[0]) / len(corners)
+            squares = [np.einsum("kd,kd->k", arm, arm) for arm in (corner - centroid for corner in corners)]
+            self._balls = x, centroid, np.sqrt(np.maximum.reduce(squares))
+        return self._balls[1:]
+
+
+# --- clearance ---
 
 
 class ShapeDistance:

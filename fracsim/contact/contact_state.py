@@ -13,7 +13,7 @@ from ..array_types import Ints, Pattern, Values
 from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
-from .clearance import Clearance, FollowingPoints, ShapeDistance, outline_radius
+from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
 from .contact_surface import ContactSurface
 from .crack_faces import ShownCells
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
@@ -73,6 +73,7 @@ def evaluate_contact(
     barrier: GapPotential,
     start: StepContact,
     facets: ContactFacets | None,
+    candidates: Ints | None = None,
     direction: FrictionDirection | None = None,
 ) -> ContactForces:
     """Forces of an obstacle on points, and on the facets between them.
@@ -84,10 +85,11 @@ def evaluate_contact(
         barrier: b.
         start: contact at the start of the step.
         facets: facets on which the obstacle acts; None: it acts on points alone.
+        candidates: (m,) points, ascending, that may be in contact now; None: all.
         direction: of friction, for its tangent; None: the tangent is exact.
     """
     lagged = start.lagged, start.friction, start.obstacle_motion
-    of_points = evaluate_points(x, area, posed, barrier, *lagged, start.points, direction)
+    of_points = evaluate_points(x, area, posed, barrier, *lagged, start.points, candidates, direction)
     if facets is None:
         return of_points
     return merge_forces(of_points, *evaluate_facets(facets, posed, x, barrier, start.facets))
@@ -103,6 +105,7 @@ class ContactState:
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
         level: time level of the current or last step.
         lagged: contact of each obstacle at the start of the step; None: without friction.
+        point_candidates: search for points near an obstacle.
         clearance: whether the body is far from the obstacles.
     """
 
@@ -137,6 +140,7 @@ class ContactState:
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
         self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
+        self.point_candidates = ProximityCandidates(edge)
         self._refuse_contact()
 
     def _refuse_contact(self) -> None:
@@ -307,9 +311,10 @@ class ContactState:
         start = self.step_contact(number)
         if start.friction is not None and start.lagged is not None:
             self._directions.setdefault(number, FrictionDirection(start.friction, start.lagged.normal))
+        candidates = self.point_candidates(posed, self.positions, self.law.barrier.width)
         points, facets = (self.positions, self.surface.area), self.facets_for(number)
         direction = self._directions.get(number)
-        return evaluate_contact(*points, posed, self.law.barrier, start, facets, direction)
+        return evaluate_contact(*points, posed, self.law.barrier, start, facets, candidates, direction)
 
     def step_contact(self, number: int) -> StepContact:
         """Contact of an obstacle at the start of the step, as its forces at the current pose depend on it."""

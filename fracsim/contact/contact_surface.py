@@ -10,6 +10,7 @@ Equations: docs/theory.md#new-crack-faces.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import cast
 
@@ -365,6 +366,10 @@ class ContactSurface:
         if self.curved:
             facets = find_saved_keys(self.comm, self._facet_keys(), saved["cut_facets"])
             self._excluded = np.sort(facets[facets >= 0])
+
+    def clear_search(self) -> None:
+        """Discard candidates among facets."""
+        self._all_facets, self._active = replace(self._all_facets), None
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""

@@ -19,6 +19,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from ..array_types import Ints, Values
+from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, smoothing_error
 from .laws import BARRIER, Barrier, GapPotential, TimeAveragedPotential
 from .node_contact import ContactForces, LaggedContact, positive_part
@@ -53,24 +54,6 @@ def facets_matter(radius: float, edge: float, width: float) -> bool:
     return edge**2 > 6 * radius * FACETS.max_bow * width
 
 
-class BoundingBalls:
-    """Balls around facets; those of the last positions are kept, as each obstacle is compared with them."""
-
-    def __init__(self, corners: Ints) -> None:
-        """`corners`: (m, c) points."""
-        self._corners = corners
-        self._last: tuple[Values, Values, Values] | None = None  # points, centroids and radii
-
-    def __call__(self, x: Values) -> tuple[Values, Values]:
-        """(m, d) centroids, and (m,) greatest distances of corners from them, m, with points at x (n, d), m."""
-        if self._last is None or self._last[0] is not x:
-            corners = [x[points] for points in self._corners.T]
-            centroid = sum(corners[1:], corners[0]) / len(corners)
-            squares = [np.einsum("kd,kd->k", arm, arm) for arm in (corner - centroid for corner in corners)]
-            self._last = x, centroid, np.sqrt(np.maximum.reduce(squares))
-        return self._last[1:]
-
-
 @dataclass(frozen=True, eq=False)
 class ContactFacets:
     """Facets of a surface.
@@ -86,8 +69,8 @@ class ContactFacets:
     smoothing: float
 
     @cached_property
-    def _bounding_balls(self) -> BoundingBalls:
-        return BoundingBalls(self.corners)
+    def _candidates(self) -> ProximityCandidates:
+        return ProximityCandidates(0.0, self.corners)
 
     @cached_property
     def max_gap_error(self) -> float:
@@ -132,17 +115,18 @@ class ContactFacets:
             centroids; (k, c) distances of corners on the tangent plane minus `max_gap_error`; (k, d) normals.
         """
         (_, c), d = self.corners.shape, x.shape[1]
-        centroid, radius = self._bounding_balls(x)
-        distance = posed.distance(centroid)
-        near = np.flatnonzero(distance < radius + float(reach.max(initial=0.0)) + self.max_gap_error)
+        near = self._candidates(posed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
         if not len(near):
             return near, np.empty(0), np.empty((0, c)), np.empty((0, d))
         facet_reach = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
-        near = near[distance[near] < radius[near] + facet_reach]
-        distance, normal = distance[near], posed.normal(centroid[near])
-        arms = x[self.corners[near]] - centroid[near, None]
+        corners = x[self.corners[near]]
+        centroid = corners.mean(axis=1)
+        radius, distance = np.linalg.norm(corners - centroid[:, None], axis=2), posed.distance(centroid)
+        is_near = distance < radius.max(axis=1, initial=0.0) + facet_reach
+        distance, normal = distance[is_near], posed.normal(centroid[is_near])
+        arms = (corners - centroid[:, None])[is_near]
         corner_bounds = distance[:, None] - self.max_gap_error + np.einsum("kcd,kd->kc", arms, normal)
-        return near, distance, corner_bounds, normal
+        return near[is_near], distance, corner_bounds, normal
 
     def distances(self, posed: PosedShape, x: Values, reach: float) -> Values:
         """(k,) distances of the closest points of facets within `reach`, m."""

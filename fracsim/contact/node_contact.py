@@ -204,6 +204,7 @@ def evaluate_points(
     friction: CoulombFriction | None,
     obstacle_motion: Values,
     start: StepStart | None = None,
+    candidates: Ints | None = None,
     direction: FrictionDirection | None = None,
 ) -> ContactForces:
     """Forces of an obstacle on points; the energy is the integral of b(gap) over the surface.
@@ -217,13 +218,18 @@ def evaluate_points(
         friction: law of friction.
         obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
         start: points at the start of the step, where the barrier is averaged over the step.
+        candidates: (m,) points, ascending, that may be in contact now; None: all.
         direction: of friction, for its tangent; None: the tangent is exact.
     """
-    gap = posed.distance(x)
-    points = np.flatnonzero(((gap if start is None else np.minimum(gap, start.gap)) < barrier.width) & (area > 0))
+    points = np.arange(len(x)) if candidates is None else candidates
+    if start is not None and candidates is not None:
+        points = np.union1d(points, np.flatnonzero(start.gap < barrier.width))
+    gap = posed.distance(x[points])
+    near = ((gap if start is None else np.minimum(gap, start.gap[points])) < barrier.width) & (area[points] > 0)
+    points, gap = points[near], gap[near]
     if friction is not None and lagged is not None and len(lagged.points):
         points = np.union1d(points, lagged.points)
-    gap = gap[points]
+        gap = posed.distance(x[points])
     if not len(points):
         return no_contact(x.shape[1], barrier.width)
     point_area, positions = area[points], x[points]

@@ -182,7 +182,8 @@ class ObstacleTerm(ContactState, Term):
         for index, (posed, q) in moving.items():
             # gaps of the current forces are those at the current poses
             min_gap = self.obstacle_forces()[index].min_gap if is_current else 0.0
-            fractions.append(safe_motion_fractions(posed, x, motion, q, self.facets_for(index), min_gap))
+            limits = self.facets_for(index), self.point_candidates, min_gap
+            fractions.append(safe_motion_fractions(posed, x, motion, q, *limits))
         return self.surface.min_fraction(np.min(fractions, axis=0))
 
     def patch(self, nodes: Ints) -> ObstaclePatch:
@@ -254,6 +255,7 @@ class ObstacleTerm(ContactState, Term):
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
+        self.surface.clear_search()
         self._shown.discard()
         self.discard_forces()
 

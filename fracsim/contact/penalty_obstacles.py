@@ -198,9 +198,10 @@ class PenaltyObstacleTerm(ObstacleTerm):
         Where facets count, a point is one whose first corner carries all.
         """
         x, names = self.positions, self.surface.keys
-        gap = posed.distance(x)
-        points = np.flatnonzero((gap < reach) & (self.surface.area > 0))
-        gap = gap[points]
+        points = self.point_candidates(posed, x, reach)
+        gap = posed.distance(x[points])
+        near = (gap < reach) & (self.surface.area[points] > 0)
+        points, gap = points[near], gap[near]
         keys, normal, stiffness = names[points], posed.normal(x[points]), self.stiffness[points]
         corners: Ints = points[:, None]
         weights: Values = np.ones((len(points), 1))

@@ -18,6 +18,7 @@ import numpy as np
 
 from ..array_types import Flags, Ints, Values
 from ..mesh.parallel import max_over_ranks, sum_over_ranks
+from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, find_closest_points
 from .contact_surface import ContactSurface
 from .facet_contact import ContactFacets
@@ -255,6 +256,7 @@ def safe_motion_fractions(
     motion: Values,
     q: Values,
     facets: ContactFacets | None = None,
+    candidates: ProximityCandidates | None = None,
     min_gap: float = 0.0,
 ) -> Values:
     """(n,) fractions in [0, 1] of motions that leave a tenth of each gap to an obstacle; 0 where a gap is closed.
@@ -265,6 +267,7 @@ def safe_motion_fractions(
         motion: (n, d) of the points, m.
         q: (p,) increment of the obstacle's pose.
         facets: facets on which the obstacle acts; corners get the fractions of their facets as well.
+        candidates: search for points near the obstacle; None: all are tested.
         min_gap: lower bound of all gaps at the start, m.
     """
     rotation = (q := posed.effective_increment(q))[posed.pose.dim :]
@@ -274,11 +277,17 @@ def safe_motion_fractions(
         rotation_motion = np.linalg.norm(rotation) * (np.linalg.norm(x - posed.pose.centre, axis=1) + reach)
         reach = reach + rotation_motion
     max_reach, fraction = LIMITS.reach * float(reach.max(initial=0.0)), np.ones(len(x))
-    if max_reach < min_gap or posed.distance_bound(x) > max_reach:
+    if max_reach < min_gap:
         return fraction
-    gap = posed.distance(x)
-    fraction[gap <= 0] = 0.0
-    near = np.flatnonzero((gap > 0) & (gap < LIMITS.reach * reach))
+    if candidates is not None:
+        tested = candidates(posed, x, max_reach)
+    elif posed.distance_bound(x) > max_reach:
+        return fraction
+    else:
+        tested = np.arange(len(x))
+    gap = posed.distance(x[tested])
+    fraction[tested[gap <= 0]] = 0.0
+    near = tested[(gap > 0) & (gap < LIMITS.reach * reach[tested])]
     if len(near):
         points = PointMotion(posed, x[near], motion[near], q)
         fraction[near] = safe_fractions(points.gap, points.speed, len(near))
