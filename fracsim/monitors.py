@@ -84,7 +84,7 @@ class RunMonitors:
         self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
         self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
         self.intersections, self.rotation = _intersection_monitor(scene), _rotation_monitor(scene)
-        self.missed_peak = _missed_peak_monitor(scene)
+        self.missed_peak = missed_peak_monitor(scene.study, scene.domain.dim)
         of_contact = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.intersections)
         optional = (*of_contact, self.load_drop, self.rotation, self.missed_peak)
         self._optional: list[Monitor] = [monitor for monitor in optional if monitor is not None]
@@ -221,14 +221,14 @@ def _rotation_monitor(scene: Scene) -> RotationStrainMonitor | None:
     return RotationStrainMonitor(stress, scene.fracture, alpha_f)
 
 
-def _missed_peak_monitor(scene: Scene) -> MissedPeakMonitor | None:
+def missed_peak_monitor(study: Study, dim: int) -> MissedPeakMonitor | None:
     """Return the monitor of peaks within a step, if a load or a motion has a table over time."""
-    tables = tabulated_conditions(scene.study, scene.domain.dim)
+    tables = tabulated_conditions(study, dim)
     if not tables:
         return None
     from .output.step_size_checks import MissedPeakMonitor
 
-    return MissedPeakMonitor(tables, scene.study.time.end)
+    return MissedPeakMonitor(tables, study.time.end)
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

@@ -13,6 +13,7 @@ from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, StepAborted, Stopped
 from .meshes.data import mesh_fingerprint
+from .monitors import missed_peak_monitor
 from .output.atomic_write import write_on_root
 from .output.checkpoint_file import (
     CHECKPOINT_LIMITS,
@@ -47,9 +48,11 @@ if TYPE_CHECKING:
     from .rigid.instances import Instances
 
 ROOT_COMM = MPI.COMM_SELF
-# Names in a checkpoint: of numbers, of monitors, and of arrays that only broken or dented bodies have.
+# Names in a checkpoint: of numbers, of monitors, of monitors that earlier versions did not store, and of arrays that
+# only broken or dented bodies have.
 CLOCK_NAMES = ("t", "step", "work", "start")
 MONITOR_NAMES = {"blows", "loads", "frames"}
+LATER_MONITOR_NAMES = {"effort", "contact_errors", "missed_peak"}
 OPTIONAL_ARRAYS = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
 ARRAYS_OF_ONE_LENGTH = (
     ("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields"),
@@ -103,6 +106,7 @@ class RigidRun:
         self.broken = self.blows = self.loads = 0
         # times, s, and errors of velocities, m/s, of steps in which contact did not converge
         self._contact_errors: list[tuple[float, float]] = []
+        self._missed_peak = missed_peak_monitor(scene.study, 3)
         self._start = scene.initial_state.bodies.kinetic_energy
         # of the parts of the run before a restart
         self._effort_before: dict[str, Any] = {"analyses": 0, "wall": 0.0, "cpu": 0.0, "seconds": {}}
@@ -137,10 +141,8 @@ class RigidRun:
             self.history.obstacle_work |= dict(
                 zip(self.history.obstacle_work, map(float, arrays["worked"]), strict=True)
             )
-            print_notes(
-                ROOT_COMM,
-                [*self.history.notes, *missing_frame_notes(folder, self._frame_counts, self.frames.files.frame_counts)],
-            )
+            missing = missing_frame_notes(folder, self._frame_counts, self.frames.files.frame_counts)
+            print_notes(ROOT_COMM, [*self.history.notes, *missing])
         self._clock = FrameSchedule(scene.study.output.every, scene.study.frame_interval)
         self._clock.record_frame(self.state.t)
         write_on_root(ROOT_COMM, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
@@ -167,8 +169,11 @@ class RigidRun:
         ):
             raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
         self.blows, self.loads, self._frame_counts = earlier["blows"], earlier["loads"], earlier["frames"]
-        # an earlier version stored none
+        # an earlier version stored none of these
         self._effort_before |= earlier.get("effort", {})
+        self._contact_errors = [(float(t), float(error)) for t, error in earlier.get("contact_errors", [])]
+        if self._missed_peak is not None:
+            self._missed_peak.from_checkpoint(earlier)
         return arrays
 
     # --- a step, a frame, a checkpoint ---
@@ -181,6 +186,8 @@ class RigidRun:
         stepper = self.scene.stepper
         self._interrupt.begin_step()
         self.state, report = stepper.advance(self.state)
+        if self._missed_peak is not None:
+            self._missed_peak.record_step(self.state.t, self.scene.study.time.max_step)
         if report.broken:
             self.frames.record_breaks(stepper.instances.damage()[0], self.state.t)
         self.broken, self.blows, self.loads = (
@@ -215,7 +222,9 @@ class RigidRun:
         arrays["worked"] = np.array([*self.history.obstacle_work.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
-        counts["effort"] = self._effort()
+        counts |= {"effort": self._effort(), "contact_errors": self._contact_errors}
+        if self._missed_peak is not None:
+            counts |= self._missed_peak.to_checkpoint()
         notes = CheckpointNotes(self.text, counts)
         fingerprint = mesh_fingerprint(self.scene.mesh)
         write_on_root(ROOT_COMM, path, lambda: write_checkpoint_file(path, arrays, clock, fingerprint, notes))
@@ -326,7 +335,8 @@ class RigidRun:
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
         write_summary(ROOT_COMM, self.folder, summary)
-        print_notes(ROOT_COMM, contact_notes(self._contact_errors))
+        missed = self._missed_peak.notes() if self._missed_peak is not None else []
+        print_notes(ROOT_COMM, [*contact_notes(self._contact_errors), *missed])
         return summary
 
     def _count_single_nodes(self) -> dict[str, float]:
@@ -371,7 +381,7 @@ def _check_stored(
     expected = initial | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
     check_names(arrays, set(expected), {*expected, *OPTIONAL_ARRAYS}, path)
     check_names(stored.clock, set(CLOCK_NAMES), set(CLOCK_NAMES), path)
-    check_names(stored.notes.monitors, MONITOR_NAMES, {*MONITOR_NAMES, "effort"}, path)
+    check_names(stored.notes.monitors, MONITOR_NAMES, MONITOR_NAMES | LATER_MONITOR_NAMES, path)
     bodies = len(arrays["body.mass"])
     for name, values in arrays.items():
         first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})

@@ -6,6 +6,7 @@ import csv
 import json
 import subprocess
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,6 +24,7 @@ from fracsim.mesh.input_topology import MeshTopology
 from fracsim.rigid.instance_placement import InstancePlacement, InstancePoses
 from fracsim.rigid.instances import Instances
 from fracsim.rigid.parallel_analyses import ImpactLoads, ParallelAnalyses, analyse_impact
+from fracsim.rigid.rigid_stepper import RigidReport, RigidState, RigidStepper
 from fracsim.studies import folder
 from fracsim.study import Study
 from fracsim.study.check import check_study
@@ -146,6 +148,44 @@ def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) ->
     assert_same(found, expected)
     drawn = [frames(folder)[-1] for folder in (tmp_path / "out", done)]
     assert np.allclose(drawn[0].points, drawn[1].points, atol=1e-6)
+
+
+def test_a_blow_within_a_step_is_told(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A hammer goes 0.1 m down and back within 2 ms, half of it before the end of a step; a restart keeps the note."""
+    way = {"time": [0.0045, 0.0055, 0.0065], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -0.1], [0.0, 0.0, 0.0]]}
+    hammer = {"name": "hammer", "shape": "sphere", "radius": 0.05, "at": [3.0, 0.0, 1.0], "displacement": way}
+    still = {"obstacle": [hammer], "body": None, "brittle": None, "fracture": None, "load": None}
+    for end, restart in ((0.008, False), (0.012, True)):
+        once = study(
+            time={"scheme": "rigid", "step": 2e-3, "end": end}, output={"picture": False, "checkpoint": 1e-9}, **still
+        )
+        run_study(MPI.COMM_SELF, once, tmp_path / "out", restart=restart)
+        assert (
+            "obstacle.0.displacement has a peak at t = 0.0055 s within a step of 0.002 s, and 50% of its largest"
+            in capfd.readouterr().err
+        )
+
+
+def test_steps_without_balanced_contact_are_told_after_a_restart(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the step that was wrong before the checkpoint, too."""
+    often = {"picture": False, "checkpoint": 1e-9}
+    advance = RigidStepper.advance
+
+    def inexact(self: RigidStepper, state: RigidState) -> tuple[RigidState, RigidReport]:
+        state, report = advance(self, state)
+        return state, replace(report, contact_error=0.25)
+
+    monkeypatch.setattr(RigidStepper, "advance", inexact)
+    run_study(
+        MPI.COMM_SELF, study(time={"scheme": "rigid", "step": 2e-3, "end": 0.004}, output=often), tmp_path / "out"
+    )
+    monkeypatch.undo()
+    capfd.readouterr()
+    longer = study(time={"scheme": "rigid", "step": 2e-3, "end": 0.006}, output=often)
+    run_study(MPI.COMM_SELF, longer, tmp_path / "out", restart=True)
+    assert "contact of rigid bodies did not converge in " in (said := capfd.readouterr().err) and "0.25 m/s" in said
 
 
 def test_a_slab_is_shot_through_and_not_carried_along(tmp_path: Path) -> None:
