@@ -35,6 +35,7 @@ from .output.run_folder import (
     FrameSchedule,
     check_continuable,
     check_output_folder,
+    early_end_notes,
     make_output_folder,
     missing_frame_notes,
     software_versions,
@@ -174,9 +175,10 @@ class Run:
         if notes is not None:
             had = notes.monitors["frames"]
             tip_notes = self.tips.notes if self.tips is not None else []
+            early = early_end_notes(notes.study_tables(), study.time.end, self.state.t)
             print_notes(
                 self.comm,
-                [*self.history.notes, *tip_notes, *missing_frame_notes(folder, had, self.frames.frame_counts)],
+                [*early, *self.history.notes, *tip_notes, *missing_frame_notes(folder, had, self.frames.frame_counts)],
             )
         self._clock = FrameSchedule(study.output.every, study.frame_interval)
         self._clock.record_frame(self.state.t)

@@ -34,6 +34,7 @@ from .output.rigid_frames import RigidFrames
 from .output.run_folder import (
     FrameSchedule,
     check_text_files,
+    early_end_notes,
     make_output_folder,
     missing_frame_notes,
     software_versions,
@@ -142,7 +143,7 @@ class RigidRun:
                 zip(self.history.obstacle_work, map(float, arrays["worked"]), strict=True)
             )
             missing = missing_frame_notes(folder, self._frame_counts, self.frames.files.frame_counts)
-            print_notes(ROOT_COMM, [*self.history.notes, *missing])
+            print_notes(ROOT_COMM, [*self._early_end, *self.history.notes, *missing])
         self._clock = FrameSchedule(scene.study.output.every, scene.study.frame_interval)
         self._clock.record_frame(self.state.t)
         write_on_root(ROOT_COMM, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
@@ -168,6 +169,7 @@ class RigidRun:
             stepper.instances.damage()[1]
         ):
             raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
+        self._early_end = early_end_notes(stored.notes.study_tables(), self.scene.study.time.end, self.state.t)
         self.blows, self.loads, self._frame_counts = earlier["blows"], earlier["loads"], earlier["frames"]
         # an earlier version stored none of these
         self._effort_before |= earlier.get("effort", {})

@@ -359,6 +359,23 @@ def test_what_may_change_changes(tmp_path: Path, stopped: Path) -> None:
     assert np.allclose(history(out)["dt"], [0.005] * 4 + [0.001] * 10)
 
 
+def test_an_end_before_the_checkpoint_is_told(
+    tmp_path: Path, stopped: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """No step is taken, and a note says so; a run that is continued with the end that it had has no such note."""
+    folder, time_ = tmp_path / "out", TEARING["time"]
+    shutil.copytree(stopped, folder)
+    rows = (folder / "history.csv").read_text()
+    run(changed(TEARING, time={"end": time_["step"]}), folder, restart=True)
+    assert f"time.end = {time_['step']:g} s lies before the checkpoint, at t = " in capsys.readouterr().err
+    assert (folder / "history.csv").read_text() == rows
+    once = tmp_path / "once"
+    # ends after 1.5 steps, and the second is not shortened
+    for restart in (False, True):
+        run(changed(TEARING, time={"end": 1.5 * time_["step"]}, output={"checkpoint": 1e-9}), once, restart=restart)
+    assert "lies before the checkpoint" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("text", ["step,time\r\n1,0.005\r\n", "nothing of a history"])
 def test_a_history_with_other_columns_is_refused(tmp_path: Path, stopped: Path, text: str) -> None:
     out = shutil.copytree(stopped, tmp_path / "out")

@@ -232,6 +232,21 @@ def missing_frame_notes(folder: Path, expected: dict[str, int], present: dict[st
     ]
 
 
+def early_end_notes(earlier: dict[str, Any], end: float, t: float) -> list[str]:
+    """Sentence about an end that was moved to before the time of the checkpoint.
+
+    Args:
+        earlier: tables of the study in the checkpoint.
+        end: time.end of the study to continue, s.
+        t: time of the checkpoint, s.
+    """
+    if end >= min(t, float(earlier["time"]["end"])):
+        return []
+    return [
+        f"time.end = {end:g} s lies before the checkpoint, at t = {t:g} s: no step is taken, and the run ends there"
+    ]
+
+
 def software_versions(comm: MPI.Comm) -> dict[str, str]:
     """Versions of the programs and the number of ranks, by `STUDY_HEADER_WORDS`."""
     return {
