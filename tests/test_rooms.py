@@ -41,7 +41,7 @@ WITHOUT_DOLFINX |= {f"contact.{name}" for name in CONTACT.split()}
 OF_REPORT = {
     "frames": {"output.fields_file", "output.surface.vtk_files"},
     "colour_maps": {"output.fields_file"},
-    "sweep": {"study.check", "study.reader", "output.lock", "output.file_ownership"},
+    "sweep": {"study.check", "study.plugins", "study.reader", "output.lock", "output.file_ownership"},
 }
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from cases import BAR, WEDGE, command, fracsim, fracsim_here, mpirun, study, swept_here, write_study
+from fracsim import __version__
 from fracsim.errors import InputError
 from fracsim.report import sweep
 from fracsim.report.runs import read_last_message
@@ -154,6 +155,35 @@ def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:
         "1 of 2 runs did not end well: snes_max_it-0_adapt-false (not converged: no solution at t = 0.01" in done.stderr
     )
     assert [row["outcome"].partition(":")[0] for row in rows(out)] == ["not converged", "done"]
+
+
+def test_a_case_of_another_version_is_kept_and_named(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    swept_here(bar, "--set", "mesh.h=0.25", "-o", out)
+    summary = out / "h-0.25" / "summary.json"
+    values = json.loads(summary.read_text())
+    values["versions"]["fracsim"] = "0.0.1"
+    summary.write_text(json.dumps(values))
+    words = f"done before, by fracsim 0.0.1; this is {__version__}: delete its folder to run it again"
+    again = swept_here(bar, "--set", "mesh.h=0.25", "-o", out)
+    assert again.returncode == 0 and words in again.stdout and rows(out)[0]["outcome"] == words
+    values["versions"]["fracsim"] = __version__
+    summary.write_text(json.dumps(values))
+    assert swept_here(bar, "--set", "mesh.h=0.25", "-o", out).stdout.splitlines()[0].endswith("h-0.25: done before")
+
+
+def test_notes_of_a_case_are_counted_and_in_the_table(tmp_path: Path) -> None:
+    """A pulse that no step of the first case ends at; the second case has no note."""
+    pulse = {"time": [0.004, 0.005, 0.006], "value": [0.0, 1.0, 0.0]}
+    held = [{"on": "left", "fix": "xyz"}, {"on": "right", "pressure": pulse}]
+    plain = {"scheme": "quasi-static", "end": 0.02}
+    bar = write_study(tmp_path / "bar.toml", BAR, boundary=held, probe=[], time=plain)
+    out = tmp_path / "out"
+    done = swept_here(bar, "--set", "time.step=0.01,0.005", "-o", out)
+    first, second = (line for line in done.stdout.splitlines() if line.startswith("["))
+    assert first.endswith(f"done (1 note in {out / 'step-0.01' / 'log.txt'})") and second.endswith("done")
+    notes = [row["notes"] for row in rows(out)]
+    assert notes[0].startswith("boundary.1.pressure has a peak at t = 0.005 s") and notes[1] == ""
 
 
 @pytest.mark.parametrize(

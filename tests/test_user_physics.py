@@ -17,7 +17,7 @@ import ufl
 from scipy.optimize import brentq
 
 import fracsim as package
-from cases import STRIP, changed, fracsim_here
+from cases import STRIP, changed, fracsim_here, swept_here
 from fracsim.errors import InputError
 from fracsim.forms.schemes import SCHEMES, EndOfStepScheme, QuasiStatic
 from fracsim.simulation import Simulation, load
@@ -563,6 +563,23 @@ def test_a_study_names_plugins_of_installed_packages(rubber: Path, page: dict[st
         assert simulation.state.step == 1
     with pytest.raises(InputError, match=r"the run was with physics: the energy yeoh of rubber 1\.2"):
         Simulation(tables, rubber / "out", restart=True, criterion=normal_stress)
+
+
+def test_a_sweep_runs_a_case_again_if_a_plugin_has_changed(rubber: Path) -> None:
+    import tomli_w
+
+    path, out = rubber / "strip.toml", rubber / "out"
+    path.write_text(tomli_w.dumps(page_study()))
+    sweep = (path, "--set", "time.end=0.01", "-o", out)
+    assert swept_here(*sweep).returncode == 0
+    assert "done before" in swept_here(*sweep).stdout
+    information = rubber / "site" / "rubber-1.2.dist-info"
+    metadata = information / "METADATA"
+    metadata.write_text(metadata.read_text().replace("1.2", "1.3"))
+    information.rename(rubber / "site" / "rubber-1.3.dist-info")
+    again = swept_here(*sweep)
+    assert again.returncode == 0 and "done before" not in again.stdout
+    assert "# physics: the energy yeoh of rubber 1.3\n" in (out / "end-0.01" / "study.toml").read_text()
 
 
 def test_the_command_line_knows_plugins(rubber: Path) -> None:

@@ -195,6 +195,15 @@ def read_log_messages(log: Path) -> str:
     return MESSAGE_PREFIX + "; ".join(line.removeprefix(MESSAGE_PREFIX) for line in messages) if messages else ""
 
 
+def read_log_notes(log: Path) -> list[str]:
+    """Notes of the program in a log, each once; none if there is no log."""
+    if not log.is_file():
+        return []
+    prefix = f"{MESSAGE_PREFIX}note: "
+    lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+    return list(dict.fromkeys(line.removeprefix(prefix) for line in lines if line.startswith(prefix)))
+
+
 def read_last_message(log: Path) -> str:
     """Last message of the program in a log, or else the last line; "" if the log is empty."""
     lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]

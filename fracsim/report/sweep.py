@@ -17,13 +17,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from .. import __version__
 from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import atomic_replacement_of_all, create
 from ..output.file_ownership import check_ownership, has_resumable_run, recorded_file_lines
 from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
+from ..study.plugins import collect_physics, physics_lines
 from ..study.reader import input_file_lines, load_study, study_text
-from .runs import MESSAGE_PREFIX, OUTCOMES, read_last_message
+from .runs import MESSAGE_PREFIX, OUTCOMES, read_last_message, read_log_notes
 
 # characters of a folder name, before a hash
 _MAX_NAME_LENGTH = 100
@@ -102,7 +104,9 @@ def _run_all(study: str, cases: list[tuple[SweepCase, str]], out: Path, ranks: i
     for number, (case, text) in enumerate(cases, 1):
         print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
         outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
-        print(one_line(outcome), flush=True)
+        count = len(read_log_notes(case.folder / "log.txt"))
+        notes = f" ({count} note{'s' if count > 1 else ''} in {case.folder / 'log.txt'})" if count else ""
+        print(one_line(outcome) + notes, flush=True)
         write_sweep_table([entry for entry, _ in cases], outcomes, out)
         if outcome.startswith("interrupted"):
             raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
@@ -186,14 +190,16 @@ def _safe_text(value: str) -> str:
 
 
 def _checked_study(path: Path, case: SweepCase, digests: dict[Path, str]) -> str:
-    """Text of study.toml of a case with lines on its files. Raises InputError, with the case, if it cannot be run.
+    """Text of study.toml of a case with lines on its plug-ins and files.
+
+    Raises InputError, with the case, if it cannot be run.
 
     `digests`: of the files of earlier cases; it is added to.
     """
     try:
         study = load_study(path, case.overrides)
         check_study(study)
-        lines = input_file_lines(study, digests)
+        lines = [*collect_physics(study).lines, *input_file_lines(study, digests)]
     except InputError as error:
         raise InputError(f"{case.folder.name}: {error}. Nothing was run") from None
     return study_text(study, lines)
@@ -253,19 +259,28 @@ def _run_environment() -> dict[str, str]:
 def _case_state(case: SweepCase, study: str) -> str:
     """State of a case: "done", "begun" (with a checkpoint) or "new".
 
-    Files of another study, or of one with another content of a mesh or obstacle file, do not count.
+    Files of another study, or of one with another content of a mesh or obstacle file or another version of a plug-in,
+    do not count.
     """
     try:
         earlier = (case.folder / "study.toml").read_text(encoding="utf-8")
         if tomllib.loads(earlier) != tomllib.loads(study):
             return "new"
-        if recorded_file_lines(earlier) != recorded_file_lines(study):
+        if any(lines(earlier) != lines(study) for lines in (recorded_file_lines, physics_lines)):
             return "new"
     except (OSError, ValueError):
         return "new"
     if _read_summary(case).get("outcome") == "done":
         return "done"
     return "begun" if (case.folder / "checkpoint" / "state.h5").is_file() else "new"
+
+
+def _describe_finished(case: SweepCase) -> str:
+    """Outcome of a case that is not run again; it names the version of the program if that was another one."""
+    version = (_read_summary(case).get("versions") or {}).get("fracsim", __version__)
+    if version == __version__:
+        return "done before"
+    return f"done before, by fracsim {version}; this is {__version__}: delete its folder to run it again"
 
 
 def _read_summary(case: SweepCase) -> dict[str, Any]:
@@ -280,7 +295,7 @@ def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
     """Run a case and return the outcome in words, with the reason of a failure."""
     state = _case_state(case, text)
     if state == "done":
-        return "done before"
+        return _describe_finished(case)
     # a run of a job array, or of a sweep that was killed
     if (holder := describe_lock_holder(case.folder)) is not None:
         return f"refused: a run is going on there ({holder})"
@@ -353,7 +368,7 @@ class _SignalForwarder:
 
 
 def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Path) -> None:
-    """Write sweep.csv with settings, outcome and numbers of summary.json of each case.
+    """Write sweep.csv with settings, outcome, notes and numbers of summary.json of each case.
 
     Args:
         cases: all cases.
@@ -363,7 +378,8 @@ def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Pat
     rows = []
     for case in cases:
         name = case.folder.name
-        row = {"case": name, **case.values, "outcome": outcomes.get(name, "not run yet")}
+        notes = read_log_notes(case.folder / "log.txt") if name in outcomes else []
+        row = {"case": name, **case.values, "outcome": outcomes.get(name, "not run yet"), "notes": "; ".join(notes)}
         rows.append(row | (_summary_numbers(case) if name in outcomes else {}))
     columns = list(dict.fromkeys(key for row in rows for key in row))
     with (
