@@ -295,6 +295,15 @@ class QuasiStatic(EndOfStepScheme):
         return u, u
 
 
+def conserves_energy(scheme: Scheme) -> bool:
+    """Return whether a scheme has no numerical dissipation in a linear body; False for schemes of users."""
+    match scheme:
+        case QuasiStatic() | CentralDifference() | Newmark(gamma=0.5) | GeneralizedAlpha(rho=1):
+            return True
+        case _:
+            return False
+
+
 SCHEMES: dict[str, type[Scheme]] = {
     "backward-euler": BackwardEuler,
     "newmark": Newmark,

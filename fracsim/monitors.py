@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
+from .forms.schemes import conserves_energy
 from .output.result_checks import (
     EnergyBalanceMonitor,
     InvertedCellMonitor,
@@ -150,7 +151,8 @@ class RunMonitors:
         trouble = irregular_event_text(self.meter.read_totals()["trouble"])
         untested = untested_balance_note(self._study.solver, is_linear=self._is_linear)
         corners = corner_contact_note(self._study)
-        of_all = (trouble, untested, corners, self.inverted.note(energy), self.energy_balance.note(time.scheme))
+        balance = self.energy_balance.note(time.scheme, conserves=conserves_energy(time.scheme_object))
+        of_all = (trouble, untested, corners, self.inverted.note(energy), balance)
         notes = [note for note in of_all if note]
         if done and self._fracture is not None and (unbroken := unbroken_note(self._fracture)):
             notes.append(unbroken)

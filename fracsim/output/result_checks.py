@@ -36,8 +36,8 @@ class CheckTolerances:
 
     Attributes:
         negligible_strain: energies below Y V strain^2 are round-off, as in a body at rest.
-        relative_energy_gain: share of the largest energy or work that a run may gain, or lose without inertia. Time
-            steps that are long compared with elastic waves gain a little.
+        relative_energy_gain: share of the largest energy or work that a run may gain, or lose if the scheme conserves
+            energy. Time steps that are long compared with elastic waves gain a little.
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
         min_tension: share of the largest stress below which a principal stress is round-off.
@@ -65,9 +65,9 @@ _ALTERNATIVE_SCHEMES = {
 class EnergyBalanceMonitor:
     """Largest rise of the energy balance elastic + kinetic + dissipated - work above its least earlier value.
 
-    A scheme with inertia may lose energy. A gain drives motion that no load causes. Projected strains at large strains
-    gain energy, and so do second-order schemes if the tangent is not positive, or if many edges break at once.
-    Without inertia all work is stored or dissipated: energy is lost in steps that are too long for their forces.
+    A gain drives motion that no load causes. Projected strains at large strains gain energy, and so do second-order
+    schemes if the tangent is not positive, or if many edges break at once. A loss is the purpose of a scheme that
+    dissipates numerically. Other schemes lose energy in steps that are too long for their forces, breaks and impacts.
 
     Attributes:
         rise: largest gain, J.
@@ -122,15 +122,17 @@ class EnergyBalanceMonitor:
         self._max_step_gain = monitors.get("energy_most", 0.0)
         self._max_gain_time = monitors.get("energy_time", 0.0)
 
-    def note(self, scheme: str) -> str:
-        """Sentence about a gain, or a loss without inertia, above the tolerance; otherwise empty.
+    def note(self, scheme: str, *, conserves: bool = False) -> str:
+        """Sentence about a gain, or a loss of a scheme that conserves energy, above the tolerance; otherwise empty.
 
-        `scheme`: key time.scheme.
+        Args:
+            scheme: key time.scheme.
+            conserves: the scheme has no numerical dissipation (`conserves_energy`).
         """
         limit = max(CHECK_TOLERANCES.relative_energy_gain * self.scale, self.floor)
-        if self.rise <= limit and self.fall > limit and scheme == "quasi-static":
+        if self.rise <= limit and self.fall > limit and conserves:
             return (
-                f"{self.fall * self._thickness:.3g} J of the work is neither stored nor dissipated, "
+                f"{self.fall * self._thickness:.3g} J of the energy is neither stored nor dissipated, "
                 f"{self.fall / self.scale:.0%} of all that was at play: forces change too much within a step; "
                 "try a shorter time.step"
             )
