@@ -12,6 +12,7 @@ Every call is collective: all ranks of the communicator make it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -41,7 +42,7 @@ from .output.fields_file import pad_to_3d  # noqa: E402
 from .output.fracture_log import FractureLog  # noqa: E402
 from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
 from .output.history import History  # noqa: E402
-from .report.run_output import RunOutput  # noqa: E402
+from .report.run_output import RunOutput, as_folder  # noqa: E402
 from .scene import Scene, build_scene  # noqa: E402
 from .simulation_inputs import Overrides, StudySource, load, prepare_inputs  # noqa: E402
 from .study.reader import find_study  # noqa: E402
@@ -83,9 +84,11 @@ def run(
         InputError: study, mesh, physics or folder cannot be used.
         NotConverged, Stopped, CannotWrite: the run ended early; the message says how to continue.
     """
+    folder = as_folder(out, "out")
+    if wall_limit is not None and not (isinstance(wall_limit, int | float) and 0 <= wall_limit < math.inf):
+        raise InputError(f"wall_limit = {wall_limit!r}: give a number of seconds, 0 or more, or None for no limit")
     body = prepare_inputs(study, overrides, comm, **parts)
     source = find_study(study) if isinstance(study, str) else study if isinstance(study, Path) else None
-    folder = Path(out)
     with failing_together(body.comm):
         run_study(
             body.comm, body.study, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
@@ -154,6 +157,7 @@ class Simulation:
         Raises:
             InputError: study, mesh, physics or folder cannot be used; the message names what and why.
         """
+        folder = None if out is None else as_folder(out, "out")
         body = prepare_inputs(
             study, overrides, comm, mesh, facets, regions, energy=energy, criterion=criterion, edge_law=edge_law,
             scheme=scheme, terms=terms, boundary=boundary,
@@ -172,8 +176,8 @@ class Simulation:
             self.scene: Scene = build_scene(self.comm, self.study, given=body.arrays, physics=body.physics)
         self._run: Run | None = None
         try:
-            if out is not None:
-                self._run = Run(self.scene, Path(out), restart=restart, overwrite=overwrite)
+            if folder is not None:
+                self._run = Run(self.scene, folder, restart=restart, overwrite=overwrite)
                 self._breaks, self._history = self._run.breaks, self._run.history
                 if self.state.step == 0:
                     self._run.write_frame()
@@ -210,8 +214,12 @@ class Simulation:
 
         Raises:
             NotConverged: the step failed; `state` is that before it.
+            InputError: the study is at its end.
         """
         self._check_open()
+        if self.scene.ended(self.state):
+            end = self.study.time.end
+            raise InputError(f"the simulation is at its end, time.end = {end:g} s: step while not simulation.ended")
         with failing_together(self.comm):
             self._advance()
         for name in self._functions:

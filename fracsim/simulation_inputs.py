@@ -109,6 +109,12 @@ def _collect(study: Study, physics: dict[str, Any]) -> Physics:
     """Return the physics given in Python and the plug-ins of a study; rigid bodies have none."""
     if study.time.scheme == "rigid" and any(value is not None and value != () for value in physics.values()):
         raise InputError(f'time.scheme = "rigid" has no physics of the user: remove {", ".join(physics)}')
+    for name in ("terms", "boundary"):
+        if not isinstance(entries := physics.get(name, ()), list | tuple):
+            needed = "classes or functions" if name == "terms" else "entries"
+            raise InputError(f"{name} is {entries!r}: give a list of {needed}, or leave it out")
+    if uncallable := [term for term in physics.get("terms", ()) if not callable(term)]:
+        raise InputError(f"terms has {uncallable[0]!r}: give a class derived from fracsim.Term, or a function")
     return collect_physics(study, **physics)
 
 

@@ -6,6 +6,7 @@ import io
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -186,6 +187,51 @@ def test_overrides_are_values_or_texts() -> None:
         load(STRIP, {"time.ende": 0.02})
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda out: load(None), "study is None: give the path of a study file, the name of a packaged study"),
+        (lambda out: load(BAR, "mesh.h=0.1"), "overrides are 'mesh.h=0.1': give values by key"),
+        (lambda out: load(BAR, {3: 0.1}), "overrides are {3: 0.1}: give values by key"),
+        (lambda out: run(BAR, None), "out is None: give the path of a folder"),
+        (lambda out: Simulation(BAR, 3), "out is 3: give the path of a folder"),
+        (lambda out: package.open_run(None), "folder is None: give the path of a folder"),
+        (lambda out: run(BAR, out, wall_limit=float("nan")), "wall_limit = nan: give a number of seconds"),
+        (lambda out: run(BAR, out, wall_limit=-1), "wall_limit = -1: give a number of seconds"),
+        (lambda out: run(BAR, out, wall_limit="1h"), "wall_limit = '1h': give a number of seconds"),
+        (lambda out: Simulation(BAR, terms=package.Term), "terms is .*Term.*: give a list of classes or functions"),
+        (lambda out: Simulation(BAR, terms=[3]), "terms has 3: give a class derived from fracsim.Term"),
+        (lambda out: Simulation(BAR, boundary={"on": "right"}), "boundary is {'on': 'right'}: give a list of entries"),
+        (lambda out: Simulation(BAR, boundary=None), "boundary is None: give a list of entries, or leave it out"),
+    ],
+)
+def test_an_argument_of_another_type_is_refused(call: Callable[[Path], Any], message: str, tmp_path: Path) -> None:
+    """`wall_limit = nan` was no limit; the others ended with an error of Python within the program."""
+    with pytest.raises(InputError, match=message):
+        call(tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_step_after_the_end_is_refused() -> None:
+    with Simulation(BAR) as simulation:
+        simulation.run()
+        rows = len(simulation.history["step"])
+        with pytest.raises(InputError, match=r"at its end, time\.end = 0\.03 s: step while not simulation\.ended"):
+            simulation.step()
+        assert len(simulation.history["step"]) == rows
+
+
+def test_names_of_columns_and_numbers_of_frames_are_offered(output: RunOutput) -> None:
+    with pytest.raises(KeyError, match=r"history\.csv has no column 'tiem'; it has: step, time, dt"):
+        output.history["tiem"]
+    with pytest.raises(KeyError, match=r"pieces\.csv has no column 'weight'; it has: time, piece"):
+        output.pieces["weight"]
+    count = len(output.frames)
+    with pytest.raises(IndexError, match=f"there is no frame {count}: the run has {count}, from 0 to {count - 1}"):
+        output.frames[count]
+    assert output.frames.times[-1] == output.history["time"][-1] and output.history.get("tiem") is None
+
+
 def test_progress_in_a_notebook_is_a_line(monkeypatch: pytest.MonkeyPatch) -> None:
     """An output cell obeys carriage returns, and has no size."""
     cell = type("OutStream", (io.StringIO,), {"__module__": "ipykernel.iostream"})()
@@ -282,7 +328,7 @@ def test_arrays_and_builders_are_meshes_too() -> None:
             for row in expected:
                 assert {**simulation.step(), "wall_step": 0} == {**row, "wall_step": 0}
     with pytest.raises(InputError, match="mesh is a int"):
-        Simulation(STRIP, mesh=3)  # type: ignore[arg-type]
+        Simulation(STRIP, mesh=3)
 
 
 def test_a_study_of_a_given_mesh_needs_the_mesh(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import html
+import os
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from ..errors import InputError
 from ..meshes.plain_files import check_readable
 from .pictures.frames import FrameSource, field_frames, load_grid, read_study, surface_frames
-from .runs import RunData, is_run, read_run
+from .runs import Columns, RunData, is_run, read_run
 
 Values = npt.NDArray[np.float64]
 
@@ -46,6 +47,8 @@ class FrameSequence(Sequence[Any]):
         """Return the grid of a frame (pyvista), or the sequence of a slice."""
         if isinstance(index, slice):
             return FrameSequence(self._sources[index])
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"there is no frame {index}: the run has {len(self)}, from 0 to {len(self) - 1}")
         return load_grid(self._sources[index])
 
 
@@ -58,7 +61,7 @@ class RunOutput:
 
     def __init__(self, folder: str | Path) -> None:
         """Raise InputError if the folder has no study.toml and no history.csv."""
-        self.folder = Path(folder)
+        self.folder = as_folder(folder, "folder")
         if not is_run(self.folder):
             raise InputError(
                 f"{self.folder} is not the output folder of a run: it has no study.toml with a history.csv; "
@@ -134,6 +137,13 @@ def open_run(folder: str | Path) -> RunOutput:
     return RunOutput(folder)
 
 
+def as_folder(path: str | Path, name: str) -> Path:
+    """Return the path of a folder. Raises InputError if it is none; `name`: of the argument."""
+    if not isinstance(path, str | os.PathLike):
+        raise InputError(f'{name} is {path!r}: give the path of a folder, as in {name}="out/bar-2d"')
+    return Path(path)
+
+
 def _read_columns(path: Path, source: str) -> dict[str, Values]:
     """Return the columns of a CSV file of numbers. Raises InputError; `source`: what writes such a file."""
     if not path.is_file():
@@ -145,4 +155,4 @@ def _read_columns(path: Path, source: str) -> dict[str, Values]:
         table = np.array([row for row in rows if len(row) == len(header)], float).reshape(-1, len(header))
     except ValueError as error:
         raise InputError(f"{path} is not a table of numbers: {error}") from None
-    return dict(zip(header, table.T, strict=True))
+    return Columns(path.name, zip(header, table.T, strict=True))

@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,19 @@ OUTCOMES: dict[int, str] = {
 }
 # begins each message of the program in a log
 MESSAGE_PREFIX = "fracsim: "
+
+
+class Columns(dict[str, Values]):
+    """Columns of a file by name; the KeyError of a name that is none lists the names."""
+
+    def __init__(self, file: str, columns: Iterable[tuple[str, Values]]) -> None:
+        """`file`: name of the file; `columns`: pairs of name and values."""
+        super().__init__(columns)
+        self._file = file
+
+    def __missing__(self, name: str) -> Values:
+        """Raise KeyError."""
+        raise KeyError(f"{self._file} has no column {name!r}; it has: {', '.join(self)}")
 
 
 @dataclass(frozen=True)
@@ -163,7 +177,7 @@ def _read_history(path: Path) -> dict[str, Values]:
     if not {"time", "step", "wall_step"} <= set(header):
         raise ValueError("history.csv has no columns step, time and wall_step")
     table = np.array([row for row in rows if len(row) == len(header)], float).reshape(-1, len(header))
-    return dict(zip(header, table.T, strict=True))
+    return Columns(path.name, zip(header, table.T, strict=True))
 
 
 def flatten_tables(data: Any, prefix: str = "") -> dict[str, Any]:

@@ -62,6 +62,7 @@ def load_study(study: str | Path | Mapping[str, Any], overrides: Sequence[str] |
     Raises:
         InputError: with one message on the first error.
     """
+    _check_types(study, overrides)
     if isinstance(study, Mapping):
         data, name = deepcopy(dict(study)), "study"
     else:
@@ -76,6 +77,20 @@ def load_study(study: str | Path | Mapping[str, Any], overrides: Sequence[str] |
     _resolve_paths(data, Path())
     _check_whole_numbers(data)
     return validate(data, name)
+
+
+def _check_types(study: Any, overrides: Any) -> None:
+    """Raise InputError if the arguments of `load_study` are of other types; Python does not check them."""
+    if not isinstance(study, str | os.PathLike | Mapping):
+        raise InputError(
+            f"study is {study!r}: give the path of a study file, the name of a packaged study, or a dict of tables"
+        )
+    is_list = isinstance(overrides, Sequence) and not isinstance(overrides, str)
+    if not (is_list or isinstance(overrides, Mapping)) or not all(isinstance(key, str) for key in overrides):
+        raise InputError(
+            f'overrides are {overrides!r}: give values by key, as in {{"mesh.h": 0.02}}, or texts, as in '
+            '["mesh.h=0.02"]'
+        )
 
 
 def validate(data: dict[str, Any], name: str) -> Study:
