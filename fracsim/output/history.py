@@ -132,10 +132,12 @@ class ProbeReader:
     def _reaction(self, probe: ProbeGroup, reactions: Callable[[], npt.NDArray[np.float64] | None]) -> VectorReading:
         """Function that returns this rank's share (d,) of the sum of `reactions` (owned dofs,), N, on a probe."""
         owned, d = self._owned_nodes(probe), self._domain.dim
+        # `reactions` of free dofs are the residual of some iterate
+        prescribed = ~self._balance.motion.free_dofs.reshape(-1, d)[owned]
 
         def read() -> npt.NDArray[np.float64]:
             forces = reactions()
-            return np.zeros(d) if forces is None else forces.reshape(-1, d)[owned].sum(axis=0)
+            return np.zeros(d) if forces is None else (forces.reshape(-1, d)[owned] * prescribed).sum(axis=0)
 
         return read
 
