@@ -22,9 +22,10 @@ from fracsim.errors import InputError, NotConverged
 from fracsim.meshes.builders.box import Box
 from fracsim.output.contact_checks import IntersectionMonitor
 from fracsim.scene import Scene
+from fracsim.study.check import check_study
 from support.intersections import intersecting_elements
 from support.ranks import run_on_ranks
-from support.scenes import break_across, each_step, make_scene, march, positions
+from support.scenes import break_across, each_step, make_scene, make_study, march, positions
 from support.torn import RUNS
 
 FINE = {"snes_rtol": 1e-9, "ksp_rtol": 1e-9}
@@ -346,3 +347,12 @@ def test_intersecting_faces_keep_their_numbers_where_others_are_excluded() -> No
     assert surface._intersecting_faces(u).tolist() == [1, 2]
     surface._exclude(np.empty(0, np.int64))
     assert surface._intersecting_faces(u).tolist() == [1, 2]
+
+
+def test_crack_faces_that_interlock_are_told() -> None:
+    """A crack through random triangles at 45 degrees does not slide under pressure; two bodies with a gap do."""
+    tables: dict[str, Any] = {"contact": {"itself": True}, "fracture": {"strength": 1.0}}
+    crack = [{"segment": [[0.0, 0.0], [1.0, 1.0]]}]
+    assert "interlock under pressure" in "\n".join(check_study(make_study(**tables, crack=crack)))
+    assert "interlock" not in "\n".join(check_study(make_study(**tables)))
+    assert "interlock" not in "\n".join(check_study(make_study(fracture=tables["fracture"], crack=crack)))

@@ -172,6 +172,9 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         if study.fracture is not None and implicit and not between_fragments:
             yield f"{_INDENT}note: where a soft body tears, contact of cracks inside a fragment takes 30 to 65 times"
             yield f'{_INDENT}the rest of a step; contact.itself = "pieces" leaves it out, and takes up to a third'
+        if study.crack:
+            yield f"{_INDENT}note: crack faces follow cells and interlock under pressure, so that they hardly slide;"
+            yield f"{_INDENT}for a plane that slides give two bodies in one mesh file, with a gap between them"
     if note := corner_contact_note(study):
         yield from (f"{_INDENT}{line}" for line in textwrap.wrap(f"note: {note}", 96))
 
