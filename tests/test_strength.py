@@ -17,7 +17,8 @@ from fracsim.fracture.strength import (
     round_points,
     weibull_factors,
 )
-from support.scenes import make_scene, march
+from fracsim.study.check import check_study
+from support.scenes import make_scene, make_study, march
 
 
 @pytest.mark.parametrize("modulus", (2.0, 8.0, 50.0))
@@ -110,3 +111,17 @@ def test_ratio_one_is_isotropic() -> None:
 def test_scatter_breaks_the_weakest_first() -> None:
     """With a modulus of 3 some edge is far below the mean: the square breaks before the tenth step."""
     assert 0 < pulled(heterogeneity={"modulus": 3.0, "seed": 1}) < 10
+
+
+def test_the_weakest_of_many_edges_is_told() -> None:
+    """The weakest of N Weibull numbers of mean 1 has mean N^(-1/m): the load of a body depends on its cells."""
+    modulus, seeds = 8.0, 400
+    for cells in (8, 16):
+        points = np.stack(np.meshgrid(*2 * [np.arange(cells) + 0.5]), axis=-1).reshape(-1, 2)
+        weakest = [weibull_factors(points, WeibullScatter(modulus, seed)).min() for seed in range(seeds)]
+        error = np.std(weakest) / np.sqrt(seeds)
+        assert abs(np.mean(weakest) - (cells**2) ** (-1 / modulus)) < 4 * error
+    scatter = {"strength": 1.0, "heterogeneity": {"modulus": modulus}}
+    lines = "\n".join(check_study(make_study(fracture=scatter)))
+    assert f"half h lowers the weakest to {4 ** (-1 / modulus):.2g} in 2D, {8 ** (-1 / modulus):.2g} in 3D" in lines
+    assert "half h" not in "\n".join(check_study(make_study(fracture={"strength": 1.0})))

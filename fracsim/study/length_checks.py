@@ -35,6 +35,9 @@ def length_scale_notes(study: Study, h: float, min_side: float) -> Iterator[str]
     if table.strength > LIMITS.max_strength_share * study.material.young and table.strength < float("inf"):
         yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
     if table.energy is None:
+        if (scatter := table.heterogeneity) is not None:
+            plane, space = (2 ** (-dim / scatter.modulus) for dim in (2, 3))
+            yield f"note: strength scatters by edge: half h lowers the weakest to {plane:.2g} in 2D, {space:.2g} in 3D"
         yield from _edge_energy_notes(study, plane_modulus(study, RegionSettings()), table.radius or h)
         return
     clearance = LIMITS.tip_clearance
