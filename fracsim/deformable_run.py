@@ -44,7 +44,7 @@ from .output.summary import ResourceMeter, print_notes, write_summary
 from .process import import_outside
 from .scene import Scene, build_scene
 from .study import Study
-from .study.conditions import initial_cracks
+from .study.conditions import condition_notes, initial_cracks
 from .study.plugins import collect_physics, physics_lines
 from .study.reader import add_missing_defaults, input_file_lines, study_text
 from .timestepping.stepper import StepReport
@@ -438,6 +438,7 @@ def run_study(
     began = time.perf_counter()
     print_notes(comm, study.frame_notes)
     if study.time.scheme == "rigid":
+        print_notes(comm, condition_notes(study, 3))
         how = {"restart": restart, "overwrite": overwrite}
         return _run_rigid(comm, study, folder, wall_limit=wall_limit, source=source, **how)
     progress = ProgressReporter(first=comm.rank == 0, end=study.time.end)

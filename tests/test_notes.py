@@ -13,6 +13,7 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
+from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
 from fracsim.scene import build_scene
 from fracsim.study.check import build_checked_mesh, check_study
@@ -29,6 +30,49 @@ HELD = [{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}]
 
 def said(data: dict[str, Any]) -> str:
     return "\n".join(check_study(validate(data, "test.toml")))
+
+
+# --- loads and lengths that do not fit the run ---
+
+LATE = {"time": [5.0, 6.0], "value": [[0.0, 0.0], [1.0, 0.0]]}
+JUMP = {"time": [0.0, 1.0], "value": [[0.02, "free"], [0.1, "free"]]}
+
+
+def pulled(motion: dict[str, Any], **tables: Any) -> dict[str, Any]:
+    return changed(STRIP, boundary=[{"on": "left", "fix": "xy"}, {"on": "right"} | motion], **tables)
+
+
+def test_a_table_after_the_end_of_the_run_is_told() -> None:
+    """As it is if its times are in ms; one that begins within the run is not told."""
+    words = "note: boundary.1.velocity: its table begins at t = 5 s, and the run ends at"
+    assert words in said(pulled({"velocity": LATE}))
+    assert words not in said(pulled({"velocity": LATE | {"time": [0.01, 6.0]}}))
+    far = {"name": "o", "shape": "sphere", "radius": 0.1, "at": [50.0, 0.0], "displacement": LATE}
+    assert "note: obstacle.0.displacement: its table begins at t = 5 s" in said(changed(STRIP, obstacle=[far]))
+
+
+def test_a_displacement_that_jumps_at_the_start_is_told() -> None:
+    """With inertia alone: quasi-static steps have no impact."""
+    words = "note: boundary.1.displacement is 0.02 m at t = 0: its nodes jump there"
+    assert words in said(pulled({"displacement": JUMP}))
+    assert words in said(pulled({"displacement": [-0.02, 0.0]}))
+    assert words not in said(pulled({"displacement": JUMP}, time={"scheme": "quasi-static"}))
+    assert words not in said(pulled({"displacement": JUMP | {"value": [[0.0, 0.0], [0.1, 0.0]]}}))
+
+
+def test_a_run_tells_what_check_tells(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    run_study(MPI.COMM_SELF, study(pulled({"displacement": JUMP})), tmp_path / "out")
+    assert "fracsim: note: boundary.1.displacement is 0.02 m at t = 0" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("radius", "words"),
+    [(300.0, "question: radius is 300 m, the body is"), (1e-6, "h: the stress is not averaged"), (0.0, ""), (0.2, "")],
+)
+def test_a_radius_that_does_not_fit_body_or_cells_is_told(radius: float, words: str) -> None:
+    text = said(changed(STRIP, fracture={"radius": radius}))
+    assert words in text
+    assert words or not re.search(r"radius is|not averaged", text)
 
 
 # --- mesh files -----------------------------------------------------------------------------------------------------

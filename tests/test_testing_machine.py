@@ -252,6 +252,7 @@ def test_motions_that_contradict_each_other_at_some_nodes_are_noted() -> None:
     """A motion that another one replaces at all its nodes is refused, whatever the names of the places."""
     held, side = {"on": "left", "fix": "xy"}, {"box": [[1.0, 0.0], [1.0, 0.25]]}
     pulled = {"on": "right", "displacement": {"time": [0, 1], "value": [[0, 0], [0.1, 0]]}}
+    lifted = {"time": [0, 1], "value": [["free", 0], ["free", 0.1]]}
 
     def notes(*boundary: dict[str, Any]) -> list[str]:
         scene = build_scene(MPI.COMM_SELF, study(STRIP, boundary=[held, *boundary], probe=[]))
@@ -262,7 +263,7 @@ def test_motions_that_contradict_each_other_at_some_nodes_are_noted() -> None:
     with pytest.raises(InputError, match="prescribe different displacements along x at all nodes"):
         notes(pulled, {"on": side, "displacement": [0.05, "free"]})
     assert notes(pulled, {"on": side, "displacement": pulled["displacement"]}) == []
-    assert notes(pulled, {"on": "top", "displacement": ["free", 0.1]}) == [
+    assert notes(pulled, {"on": "top", "displacement": lifted}) == [
         "boundary.0 and boundary.2 prescribe different displacements along y at 1 node, where boundary.2 holds",
         "boundary.1 and boundary.2 prescribe different displacements along y at 1 node, where boundary.2 holds",
     ]

@@ -31,7 +31,13 @@ from ..mesh.selection import select_facets, select_nodes
 from ..mesh.selectors import Group, check_regions
 from ..meshes.data import AXES
 from ..study import Study, solver_options
-from ..study.conditions import BoundaryCondition, boundary_conditions, loaded_components, volume_loads
+from ..study.conditions import (
+    BoundaryCondition,
+    boundary_conditions,
+    condition_notes,
+    loaded_components,
+    volume_loads,
+)
 from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 
 # --- material ---
@@ -334,7 +340,8 @@ def build_balance(
     entries = boundary_conditions(study, domain.dim, physics.boundary)
     motions = [entry for entry in entries if entry.prescribes_motion]
     prescribed = [_prescribed(domain, entry, study.time.end) for entry in motions]
-    motion = PrescribedMotion(domain, prescribed, conflict_notes(domain, motions, prescribed, study.time.end))
+    notes = [*conflict_notes(domain, motions, prescribed, study.time.end), *condition_notes(study, domain.dim)]
+    motion = PrescribedMotion(domain, prescribed, notes)
     check_loads(domain, motion, entries)
     density = coefficient(domain, material.density)
     mass: MassMatrix = LumpedMass(assembler, density)

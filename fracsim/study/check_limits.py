@@ -32,6 +32,7 @@ class CheckLimits:
         max_linear_rotation: rotation of a fragment in rad from which its swelling by 1/cos is visible: half a percent.
         max_linear_poisson: Poisson's ratio from which linear cells lock: with four across, a beam is a third too stiff.
         max_strength_share: strength over Young's modulus; only rubber is stronger.
+        min_radius_share: radius of the average over h, below which a cell has itself alone.
         max_side, min_side: side lengths in m of bodies that break as one, and of a continuum.
         soft_young, soft_density: Pa and kg/m^3; rubber and gels are softer, and not as dense.
         min_density, max_density: kg/m^3 of foams, and of the densest metals.
@@ -76,6 +77,7 @@ class CheckLimits:
     max_linear_poisson: float = 0.49
     max_strength_share: float = 0.1
     max_side: float = 20.0
+    min_radius_share: float = 0.3
     min_side: float = 1e-6
     soft_young: float = 1e6
     soft_density: float = 1600.0

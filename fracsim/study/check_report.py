@@ -16,6 +16,7 @@ import numpy as np
 from . import BrittleSettings, ContactSettings, FractureSettings, ObstacleSettings, Study
 from .body import RegionSettings
 from .check_limits import LIMITS
+from .conditions import condition_notes
 from .length_checks import (
     check_branching_dimension,
     energy_criterion_notes,
@@ -136,7 +137,7 @@ def _fracture_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         if table is not None and not table.crumbs and not table.retains_nodes(study.material.energy):
             yield f'{_INDENT}note: crumbs = false retains no node with approach = "edge" and the corotated energy;'
             yield f'{_INDENT}energy = "linear" or approach = "chi" does'
-    notes = length_scale_notes(study, summary.h, summary.min_side)
+    notes = length_scale_notes(study, summary.h, summary.min_side, summary.max_side)
     for line in (*notes, *small_strain_notes(study), *_direction_notes(study, summary)):
         yield f"{_INDENT}{line}"
 
@@ -146,8 +147,14 @@ def _load_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     kinds = [entry.kind for entry in study.boundary]
     yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
     yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
-    for line in resultant_lines(study, summary.dim, summary.mesh):
+    for line in (*resultant_lines(study, summary.dim, summary.mesh), *_condition_lines(study, summary.dim)):
         yield f"{_INDENT}{line}"
+
+
+def _condition_lines(study: Study, dim: int) -> Iterator[str]:
+    """Yield notes on tables over time and displacements at the start."""
+    for note in condition_notes(study, dim):
+        yield from textwrap.wrap(f"note: {note}", 96)
 
 
 def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
@@ -211,6 +218,7 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     else:
         yield "fracture    off: no analyses"
     yield f"obstacles   {_obstacle_list(study) or 'none'}"
+    yield from (f"{_INDENT}{line}" for line in _condition_lines(study, summary.dim))
     contact = study.contact or ContactSettings()
     duration = "Hertz's time" if contact.contact_time is None else f"{contact.contact_time:g} s"
     restitution = contact.restitution or 0.0

@@ -276,6 +276,28 @@ def tabulated_conditions(study: Study, dim: int) -> dict[str, tuple[Values, Time
     return result
 
 
+def condition_notes(study: Study, dim: int) -> list[str]:
+    """Sentences on tables that begin after the end of the run, and on displacements that jump at its start."""
+    end = study.time.end
+    notes = [
+        f"{key}: its table begins at t = {times[0]:g} s, and the run ends at {end:g} s: only its first value acts"
+        for key, (times, _) in tabulated_conditions(study, dim).items()
+        if len(times) > 1 and times[0] >= end
+    ]
+    if not study.time.scheme_class.inertia:
+        return notes
+    for i, entry in enumerate(study.boundary):
+        if entry.kind != "displacement":
+            continue
+        function = time_function(entry.displacement, f"boundary.{i}.displacement", dim)
+        if (jump := float(np.abs(np.nan_to_num(function(0.0))).max())) > 0:
+            notes.append(
+                f"boundary.{i}.displacement is {jump:g} m at t = 0: its nodes jump there in the first step, which is "
+                "an impact; let it grow from 0, as in { time = [0, 0.1], value = [[0, 0, 0], [0.02, 0, 0]] }"
+            )
+    return notes
+
+
 def obstacle_placements(study: Study, dim: int) -> list[ObstaclePlacement]:
     """Returns all entries of [[obstacle]].
 

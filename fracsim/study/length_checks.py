@@ -21,16 +21,25 @@ from .conditions import boundary_conditions, initial_motion, obstacle_placements
 from .material_library import MATERIALS
 
 
-def length_scale_notes(study: Study, h: float, min_side: float) -> Iterator[str]:
+def length_scale_notes(study: Study, h: float, min_side: float, max_side: float) -> Iterator[str]:
     """Yield notes on strength, energy and cell size that do not fit together.
 
     Args:
         study: with any table.
         h: cell size, m; infinite if it is not known.
         min_side: least side of the body, m.
+        max_side: longest side of the body, m.
     """
     table = study.fracture
-    if table is None or study.brittle is not None:
+    if table is None:
+        return
+    if table.radius and table.radius > max_side:
+        yield f"question: radius is {table.radius:g} m, the body is {max_side:.4g} m long: is the radius in mm? With a"
+        yield "stress that is averaged over the whole body no place breaks before another"
+    if table.radius and table.radius < LIMITS.min_radius_share * h < float("inf"):
+        yield f"note: radius is {table.radius / h:.2g} h: the stress is not averaged, and cracks depend on the mesh;"
+        yield 'take a radius of several h, or kernel = "neighbours"'
+    if study.brittle is not None:
         return
     if table.strength > LIMITS.max_strength_share * study.material.young and table.strength < float("inf"):
         yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
