@@ -207,6 +207,22 @@ def test_nothing_runs_where_one_combination_is_wrong(tmp_path: Path) -> None:
     assert not out.exists()
 
 
+def test_two_ways_to_write_a_value_are_one_case(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    done = fracsim_here("sweep", bar, "--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,1e-2", "-o", out)
+    assert done.returncode == 2 and "--set: time.step = 0.01 and 1e-2 are the same value" in done.stderr
+    assert not out.exists()
+
+
+def test_the_folder_of_a_run_is_not_that_of_a_sweep(tmp_path: Path) -> None:
+    bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
+    assert fracsim_here("run", bar, "-o", out).returncode == 0
+    before = sorted(out.iterdir())
+    done = fracsim_here("sweep", bar, "--set", "mesh.h=0.25,0.125", "-o", out)
+    assert done.returncode == 2 and f"--out {out}: the folder is that of a run" in done.stderr
+    assert sorted(out.iterdir()) == before
+
+
 def test_the_list_has_a_whole_command_a_line(tmp_path: Path) -> None:
     bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out of the way"
     listed = fracsim("sweep", bar, *KEYS, "-o", out, "--list")

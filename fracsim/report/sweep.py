@@ -20,7 +20,7 @@ from typing import Any
 from .. import __version__
 from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import atomic_replacement_of_all, create
-from ..output.file_ownership import check_ownership, has_resumable_run, recorded_file_lines
+from ..output.file_ownership import check_ownership, has_resumable_run, is_fracsim_folder, recorded_file_lines
 from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
 from ..study.plugins import collect_physics, physics_lines
@@ -71,8 +71,11 @@ def run_sweep(
     if not only_list:
         _refuse_mpirun()
     cases = sweep_cases(sets, out)
+    if is_fracsim_folder(out):
+        raise InputError(f"--out {out}: the folder is that of a run; give the sweep an empty or a new folder")
     digests: dict[Path, str] = {}  # a file that many cases read is read once
     texts = [_checked_study(path, case, digests) for case in cases]
+    _check_distinct(cases, texts)
     for case, text in zip(cases, texts, strict=True):
         _check_folder(case, text, path, overwrite)
     if only_list:
@@ -201,8 +204,18 @@ def _checked_study(path: Path, case: SweepCase, digests: dict[Path, str]) -> str
         check_study(study)
         lines = [*collect_physics(study).lines, *input_file_lines(study, digests)]
     except InputError as error:
-        raise InputError(f"{case.folder.name}: {error}. Nothing was run") from None
+        raise InputError(f"{case.folder.name}: {str(error).rstrip('.')}. Nothing was run") from None
     return study_text(study, lines)
+
+
+def _check_distinct(cases: list[SweepCase], texts: list[str]) -> None:
+    """Raise InputError if two cases are the same study, as with the values 0.01 and 1e-2."""
+    first: dict[str, SweepCase] = {}
+    for case, text in zip(cases, texts, strict=True):
+        if (earlier := first.setdefault(text, case)) is not case:
+            differing = [key for key, value in case.values.items() if earlier.values[key] != value]
+            listed = " and ".join(f"{key} = {earlier.values[key]} and {case.values[key]}" for key in differing)
+            raise InputError(f"--set: {listed} are the same value; remove one of them. Nothing was run")
 
 
 def _check_folder(case: SweepCase, study: str, path: Path, overwrite: bool) -> None:
