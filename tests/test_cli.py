@@ -10,6 +10,7 @@ from typing import Any
 
 import dolfinx
 import meshio
+import numpy as np
 import pytest
 
 import fracsim as package
@@ -114,16 +115,21 @@ def test_check_notes_what_contact_inside_fragments_costs(
 
 
 @pytest.mark.parametrize(
-    ("step", "scheme", "energy", "told"),
-    [(1e-2, "newmark", "neo-hookean", True), (1e-4, "newmark", "neo-hookean", False),
-     (1e-2, "newmark", "linear", False), (1e-2, "generalized-alpha", "neo-hookean", False)],
+    ("step", "scheme", "energy", "strength", "told"),
+    [(1e-2, "newmark", "neo-hookean", np.inf, True), (1e-4, "newmark", "neo-hookean", np.inf, False),
+     (1e-2, "newmark", "linear", np.inf, False), (1e-2, "generalized-alpha", "neo-hookean", np.inf, False),
+     (1e-2, "generalized-alpha", "neo-hookean", 1.5e5, True), (1e-2, "generalized-alpha", "neo-hookean", 2e4, False),
+     (1e-4, "generalized-alpha", "neo-hookean", 1.5e5, False), (1e-2, "backward-euler", "neo-hookean", 1.5e5, False)],
 )  # fmt: skip
-def test_check_tells_where_newmark_may_gain_energy(step: float, scheme: str, energy: str, told: bool) -> None:
+def test_check_tells_where_schemes_may_gain_energy(
+    step: float, scheme: str, energy: str, strength: float, told: bool
+) -> None:
     """Rubber, h = 0.125 m, c = 32 m/s: an edge is passed in 4 ms."""
     rubber = {"energy": energy, "young": 1e6, "poisson": 0.3, "density": 1e3}
     bar = {"builder": "box", "size": [1.0, 0.25, 0.25], "h": 0.125}
     data = {"title": "bar", "mesh": bar, "material": rubber, "time": {"scheme": scheme, "step": step, "end": 1.0}}
-    assert any('scheme = "generalized-alpha" does not' in line for line in check_study(validate(data, "bar"))) == told
+    data["fracture"] = {"strength": strength}
+    assert any('scheme = "backward-euler" does not' in line for line in check_study(validate(data, "bar"))) == told
 
 
 def test_check_tells_of_fracture() -> None:

@@ -54,13 +54,6 @@ class CheckTolerances:
 
 CHECK_TOLERANCES = CheckTolerances()
 
-# Schemes proposed instead of each scheme. Newmark's conserves the energy of linear bodies only, if steps are long.
-_ALTERNATIVE_SCHEMES = {
-    "backward-euler": "",
-    "quasi-static": "",
-    "newmark": 'time.scheme = "generalized-alpha" or "backward-euler", or ',
-}
-
 
 class EnergyBalanceMonitor:
     """Largest rise of the energy balance elastic + kinetic + dissipated - work above its least earlier value.
@@ -142,7 +135,7 @@ class EnergyBalanceMonitor:
         if self._max_step_gain >= CHECK_TOLERANCES.single_step_share * self.rise:
             share = min(self._max_step_gain / self.rise, 1.0)
             one_step = f" ({share:.0%} of it in the step to t = {self._max_gain_time:g} s)"
-        alternative = _ALTERNATIVE_SCHEMES.get(scheme, 'time.scheme = "backward-euler", or ')
+        alternative = "" if scheme in {"backward-euler", "quasi-static"} else 'time.scheme = "backward-euler", or '
         return (
             f"the body gained {self.rise * self._thickness:.3g} J of energy from nowhere{one_step}, "
             f"{self.rise / self.scale:.0%} of all that was at play: its motion is not to be trusted; "

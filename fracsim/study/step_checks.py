@@ -39,8 +39,8 @@ def time_step_lines(study: Study, dim: int, h: float, mesh: MeshData | None) -> 
     if timing.breaking_step is not None:
         yield f"            steps in which edges break are {timing.breaking_step:g} s at most"
     if _may_gain_energy(study, h):
-        yield "            note: in steps this long Newmark's method may gain energy at large strains;"
-        yield '            scheme = "generalized-alpha" does not'
+        yield f"            note: in steps this long {timing.scheme} may gain energy at large strains;"
+        yield '            scheme = "backward-euler" does not'
 
 
 def _explicit_lines(study: Study, steps: str, stable: float) -> Iterator[str]:
@@ -117,11 +117,13 @@ def _lame_parameters(study: Study, dim: int, region: RegionSettings) -> tuple[fl
 
 
 def _may_gain_energy(study: Study, h: float) -> bool:
-    """Returns whether Newmark's steps are long for waves through cells of size h (m) at finite strains.
+    """Returns whether steps are long for waves through cells of size h (m) at finite strains.
 
-    With linear forces the method conserves energy (mechanics.contact_time_weights).
+    With linear forces no scheme gains energy (mechanics.contact_time_weights). Newmark's method gains it at finite
+    strains, generalized-alpha where bodies tear at finite strains.
     """
-    material = study.material
-    if study.time.scheme != "newmark" or material.energy == "linear":
+    material, fracture, scheme = study.material, study.fracture, study.time.scheme
+    is_torn_soft = fracture is not None and LIMITS.min_soft_strain < fracture.strength / material.young < np.inf
+    if material.energy == "linear" or not (scheme == "newmark" or (scheme == "generalized-alpha" and is_torn_soft)):
         return False
     return study.time.max_step * float(np.sqrt(material.young / material.density)) > LIMITS.max_wave_passes * h
