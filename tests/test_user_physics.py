@@ -336,10 +336,10 @@ def test_a_load_of_time_and_place_has_its_resultant(kind: str) -> None:
     ("entry", "message"),
     [
         ({"on": "right", "displacement": [0.1, 0.0]}, "with a function of t"),
-        ({"on": "right", "displacement": lambda t: [0.1]}, "2 finite numbers needed"),
-        ({"on": "right", "displacement": lambda t: [np.nan, 0.0]}, "2 finite numbers needed"),
-        ({"on": "right", "displacement": lambda t, x: x[:, :1]}, "is not finite with the shape (n, 2)"),
-        ({"on": "right", "traction": lambda t, x: x[:, 0]}, "is not finite with the shape (n, 2)"),
+        ({"on": "right", "displacement": lambda t: [0.1]}, "at t = 0 s has 1 number; 2 needed"),
+        ({"on": "right", "displacement": lambda t: [np.nan, 0.0]}, "at t = 0 s is nan; finite numbers needed"),
+        ({"on": "right", "displacement": lambda t, x: x[:, :1]}, "numbers; 2 for each of"),
+        ({"on": "right", "traction": lambda t, x: x[:, 0]}, "numbers; 2 for each of"),
         ({"on": "right", "force": lambda t, x: x}, "a force is a resultant"),
         ({"on": "right", "traction": lambda t: [1.0, 0.0], "components": "x"}, "remove components"),
         ({"on": "rihgt", "displacement": lambda t: [0.1, 0.0]}, "rihgt"),
@@ -351,6 +351,21 @@ def test_a_load_that_is_wrong_is_refused(entry: dict[str, Any], message: str) ->
     tables = changed(STRIP, boundary=[fixed, driven] if entry["on"] == "left" else [fixed])
     with pytest.raises(InputError, match=re.escape(message)):
         Simulation(tables, boundary=[entry])
+
+
+@pytest.mark.parametrize(
+    "pull", [lambda t: [np.nan if 0 < t < 0.2 else 0.0, 0.0], lambda t, x: np.where(0 < t < 0.2, np.inf, 0 * x)]
+)
+def test_a_load_that_is_not_finite_within_the_run_is_named(pull: Any) -> None:
+    """Start and end of the run are finite."""
+    tables = changed(STRIP, boundary=STRIP["boundary"][:1], time={"step": 0.1, "end": 0.2})
+    for kind in ("displacement", "traction"):
+        message = rf"{kind} at t = 0\.\d+ s is (nan|inf); finite numbers needed"
+        with (
+            pytest.raises(InputError, match=message),
+            Simulation(tables, boundary=[{"on": "right", kind: pull}]) as simulation,
+        ):
+            simulation.step()
 
 
 # --- terms of the balance -------------------------------------------------------------------------------------------

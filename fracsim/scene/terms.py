@@ -135,8 +135,7 @@ class TermInputs:
         facets = [select_facets(self.domain, condition.selector, f"{condition.key}.on") for condition in conditions]
         for condition in conditions:
             if isinstance(condition.function, PlaceFunction):
-                placed, size = condition.function.at(self.domain.nodes), 1 if kind == "pressure" else self.domain.dim
-                _check_placed(self.domain, placed, size, self.study.time.end, condition)
+                _check_placed(self.domain, condition.function.at(self.domain.nodes), self.study.time.end)
         return [(numbers, condition.function) for numbers, condition in zip(facets, conditions, strict=True)]
 
 
@@ -255,7 +254,7 @@ def _prescribed(domain: Domain, entry: BoundaryCondition, end: float) -> Entry:
     nodes, function = select_nodes(domain, entry.selector, f"{entry.key}.on"), entry.function
     if isinstance(function, PlaceFunction):
         placed = function.at(domain.nodes[nodes])
-        _check_placed(domain, placed, domain.dim, end, entry)
+        _check_placed(domain, placed, end)
         return nodes, entry.components, placed
     return nodes, entry.components, function
 
@@ -316,19 +315,16 @@ def check_loads(domain: Domain, motion: PrescribedMotion, entries: Sequence[Boun
             )
 
 
-def _check_placed(domain: Domain, function: PlacedFunction, size: int, end: float, entry: BoundaryCondition) -> None:
-    """Raise InputError on all ranks unless a function of the user has finite values at its places (collective)."""
+def _check_placed(domain: Domain, function: PlacedFunction, end: float) -> None:
+    """Raise InputError on all ranks unless a function of the user has its values at start and end (collective)."""
     wrong = ""
-    for t in (0.0, end):
-        try:
-            values = function(t)
-        except (TypeError, ValueError) as error:
-            wrong = f"is no array of numbers: {error}"
-            break
-        if values.size != size * len(function.x) or not np.isfinite(values).all():
-            wrong = f"is not finite with the shape (n, {size}), n = {len(function.x)}"
+    try:
+        for t in (0.0, end):
+            function(t)
+    except InputError as error:
+        wrong = str(error)
     if messages := [message for message in domain.comm.allgather(wrong) if message]:
-        raise InputError(f"{entry.key}: {entry.kind} as a function of t and x {messages[0]}")
+        raise InputError(messages[0])
 
 
 def build_balance(

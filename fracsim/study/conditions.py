@@ -201,23 +201,41 @@ def _user_condition(entry: Mapping[str, Any], dim: int, number: int, study: Stud
     has_place, size = len(inspect.signature(function).parameters) > 1, 1 if kind == "pressure" else dim
     if has_place and kind == "force":
         raise InputError(f"{key}: a force is a resultant, which has no place: give a traction as a function of t and x")
+    checked = _checked_function(function, size, f"{key}: {kind}")
     if not has_place:
-        _check_values(function, study.time.end, size, f"{key}: {kind}")
+        for t in (0.0, study.time.end):
+            checked(t)
     share = 1 / study.thickness if kind == "force" else 1.0
-    value = PlaceFunction(function) if has_place else (lambda t: share * np.asarray(function(t), float).reshape(-1))
+    value = PlaceFunction(checked) if has_place else (lambda t: share * checked(t))
     prescribed = components if kind == "displacement" else np.zeros(dim, bool)
     return BoundaryCondition(key, kind, find_selector(on, dim, f"{key}.on"), value, prescribed)
 
 
-def _check_values(function: Callable[[float], Any], end: float, size: int, what: str) -> None:
-    """Raises InputError unless a function of the user returns `size` numbers at the start and the end."""
-    for t in (0.0, end):
+def _checked_function(function: Callable[..., Any], size: int, what: str) -> Callable[..., Values]:
+    """Returns a function of the user of t, or of t and n places, that raises InputError at values it cannot have.
+
+    Args:
+        function: returns `size` numbers, for each of the places if it has them.
+        size: number of components.
+        what: key and kind of the condition, for messages.
+    """
+
+    def values_at(t: float, *places: Values) -> Values:
+        count = size * len(places[0]) if places else size
         try:
-            values = np.asarray(function(t), float).reshape(-1)
+            values = np.asarray(function(t, *places), float).reshape(-1)
         except (TypeError, ValueError) as error:
-            raise InputError(f"{what} at t = {t:g} s is no vector of numbers: {error}") from None
-        if values.shape != (size,) or not np.isfinite(values).all():
-            raise InputError(f"{what} at t = {t:g} s is {values.tolist()}; {size} finite numbers needed")
+            raise InputError(f"{what} at t = {t:g} s is no vector of numbers: {error}") from error
+        if len(values) != count:
+            needed = f"{size} for each of {len(places[0])} places" if places else str(size)
+            raise InputError(
+                f"{what} at t = {t:g} s has {len(values)} number{'s' * (len(values) != 1)}; {needed} needed"
+            )
+        if not np.isfinite(values).all():
+            raise InputError(f"{what} at t = {t:g} s is {values[~np.isfinite(values)][0]:g}; finite numbers needed")
+        return values
+
+    return values_at
 
 
 def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
