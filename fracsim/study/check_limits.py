@@ -43,8 +43,6 @@ class CheckLimits:
         min_irwin_length: m, a few atoms.
         max_gravity: m/s^2.
         max_wave_passes: times that a wave passes an edge in a step, from which second-order schemes may gain energy.
-        min_soft_strain: strength over Young's modulus from which generalized-alpha may; 0.15 in `bar-2d`, which gains
-            energy, and 0.025 in `doormat`, which gains none.
         max_steps: explicit steps without a note.
         stable_share_random, stable_share_lattice: stable step over the time of a wave through the finest cells of size
             h, for meshes that are not built: 0.36 to 0.39 and 0.12 to 0.14 for random points, 0.63 and 0.48 for
@@ -93,7 +91,6 @@ class CheckLimits:
     min_irwin_length: float = 1e-9
     max_gravity: float = 1000.0
     max_wave_passes: float = 2.0
-    min_soft_strain: float = 0.1
     max_steps: float = 1e6
     stable_share_random: ByDimension = field(default_factory=lambda: {2: 0.37, 3: 0.13})
     stable_share_lattice: ByDimension = field(default_factory=lambda: {2: 0.63, 3: 0.48})
